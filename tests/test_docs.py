@@ -120,10 +120,12 @@ def run_python_blocks(path, containing=""):
     return names
 
 
+@pytest.mark.slow
 def test_python_blocks_of_own_detections_run():
     run_python_blocks(DOCS / "own_detections.md")
 
 
+@pytest.mark.slow
 def test_python_blocks_of_evaluate_your_agent_run(capsys):
     """The searcher beats Random in the few episodes of the page."""
     names = run_python_blocks(DOCS / "evaluate_your_agent.md")

@@ -3,6 +3,7 @@
 import itertools
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.scenes import APARTMENTS, BOOK, CATEGORIES, CHAIR, FRIDGE, ROOMS, SMALL, coarse_scene, draw, maze_scene
@@ -96,6 +97,7 @@ def test_planner_uses_nothing_it_has_not_detected(seed, rules):
         assert (search.length, search.success) == (altered_search.length, altered_search.success)
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 999), rules=st.sampled_from([ROOMS, APARTMENTS]))
 def test_planner_is_never_faster_than_the_shortest_path(seed, rules):

@@ -21,6 +21,7 @@ def run_dir(tmp_path_factory):
     return draw_run(tiny_config(tmp_path_factory.mktemp("sweep"))).config.run_dir
 
 
+@pytest.mark.slow
 def test_sweep_prints_a_table_and_writes_figure_and_numbers(run_dir, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     assert main([str(run_dir), *OPTIONS]) == 0
@@ -56,6 +57,7 @@ def test_sweep_prints_markdown(run_dir, tmp_path, capsys):
     assert out.with_suffix(".json").exists()
 
 
+@pytest.mark.slow
 def test_sweep_without_plotting_packages_prints_and_writes_numbers(run_dir, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     out = tmp_path / "figure.png"

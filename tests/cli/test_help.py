@@ -9,6 +9,7 @@ import typing
 from pathlib import Path
 
 import pytest
+from support.tiers import params_by_tier
 
 from jaxnav.__main__ import COMMANDS, main
 from jaxnav.cli.completion import list_command_types
@@ -161,10 +162,14 @@ def test_scripts_of_the_repository_have_the_help_of_their_command(capsys, monkey
 # Closed streams
 
 
+#: Commands with a closed stream, and their exit codes.
+CLOSED_STREAMS = [("--help >&-", 0), ("log --help >&-", 0), ("log --help 2>&-", 0), ("log 2>&-", 2), ("play <&-", 2)]
+
+
 @pytest.mark.skipif(os.name != "posix", reason="needs a shell")
 @pytest.mark.parametrize(
     ("words", "exit_code"),
-    [("--help >&-", 0), ("log --help >&-", 0), ("log --help 2>&-", 0), ("log 2>&-", 2), ("play <&-", 2)],
+    params_by_tier(CLOSED_STREAMS, fast=CLOSED_STREAMS[:1], slow=CLOSED_STREAMS),
 )
 def test_commands_end_quietly_where_a_stream_is_closed(words, exit_code):
     command = f"{sys.executable} -m jaxnav {words}"

@@ -29,6 +29,7 @@ def build_world(world: str) -> tuple[Bank, ObjectNav, EnvParams]:
     return bank, env, params
 
 
+@pytest.mark.slow
 @all_worlds
 def test_no_observation_bit_predicts_success_better_than_the_goals_detection(world):
     bank, env, params = build_world(world)
@@ -37,6 +38,7 @@ def test_no_observation_bit_predicts_success_better_than_the_goals_detection(wor
     assert len(leaks.goals) >= 0.75 * leaks.num_goals
 
 
+@pytest.mark.slow
 @all_worlds
 def test_find_leaks_flags_success_bits_planted_in_the_rows(world):
     bank, env, params = build_world(world)

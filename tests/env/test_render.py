@@ -102,6 +102,7 @@ def gym_env():
     return gymnasium.make("jaxnav.env.gym:jaxnav/rooms-v0", split="val", render_mode="rgb_array")
 
 
+@pytest.mark.slow
 def test_gymnasium_renders_the_episode(gym_env):
     gym_env.reset(seed=0)
     first_frame = gym_env.render()

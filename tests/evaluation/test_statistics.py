@@ -226,6 +226,7 @@ def test_jackknife_interval_has_its_nominal_coverage(size):
     assert coverage(jackknifed, size, draws=300) >= 0.90
 
 
+@pytest.mark.slow
 def test_episode_bootstrap_has_too_low_coverage():
     assert coverage(episode_bootstrap, (20, 3), draws=60) < 0.85
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
+from support.tiers import params_by_tier
 
 from jaxnav.cli.study import parse_study
 from jaxnav.experiments import pages
@@ -86,7 +87,7 @@ def test_committed_results_are_written_as_they_were_read(name, tmp_path):
         assert json.loads(new_head)["shared"] == json.loads(head)["shared"]
 
 
-@pytest.mark.parametrize("name", COMMITTED)
+@pytest.mark.parametrize("name", params_by_tier(COMMITTED, fast=["claims", "streams"], slow=COMMITTED))
 def test_pages_can_be_written_from_the_first_result_on(name, tmp_path):
     """Pages are written after every part, so that an interrupted experiment has them."""
     config = dataclasses.replace(copy_documents(COMMITTED[name], tmp_path), results=tmp_path / "results")

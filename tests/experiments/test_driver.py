@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import shutil
 import signal
 import time
 from collections.abc import Iterator
@@ -21,13 +20,12 @@ from jaxnav.errors import InputError
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.experiments import driver
 from jaxnav.experiments.bench import Bench
-from jaxnav.experiments.config import EXPERIMENTS, AgentRun, ExperimentConfig, check_experiment
-from jaxnav.experiments.driver import Measurement, Part, list_parts, load_results, run_experiment, write_pages
+from jaxnav.experiments.config import AgentRun, ExperimentConfig, check_experiment
+from jaxnav.experiments.driver import Measurement, Part, list_parts, load_results, run_experiment
 from jaxnav.experiments.table import ResultRow
 from jaxnav.runs.config_files import apply_yaml
 from jaxnav.runs.run import Run
 
-REPOSITORY = Path(__file__).parents[2]
 QUIET = Console(quiet=True)
 #: A page with all results, and the number of those that are missing.
 TEMPLATE = """# {{ config.title }}
@@ -264,24 +262,6 @@ def test_parts_depend_on_the_agents_that_they_compare(tmp_path):
         *("near-a-evaluation", "near-c-evaluation", "near-c-groups", "near-a-account"),
         *("near-a-trials-0", "near-a-trials-0.5"),
     ]
-
-
-@pytest.mark.parametrize("name", ["study_quick", "table2", "table3", "few_scenes", "real_homes"])
-def test_packaged_pages_are_written_from_the_first_results_on(name, tmp_path, monkeypatch):
-    monkeypatch.chdir(REPOSITORY)
-    monkeypatch.setattr("jaxnav.experiments.pages._draw_figure", lambda document, name, *_: f"{name}.png")
-    packaged = check_experiment(apply_yaml(ExperimentConfig(), name, EXPERIMENTS))
-    pages = {str(tmp_path / Path(document).name): template for document, template in packaged.pages.items()}
-    config = dataclasses.replace(packaged, results=tmp_path / "results", pages=pages)
-
-    # Every measurement begins with a part that pages have to do without the later ones.
-    parts = list_parts(config, Bench(config, QUIET))
-    folder = results_of(tmp_path)
-    folder.mkdir(parents=True)
-    for index, part in enumerate(parts):
-        shutil.copy(packaged.results / "val" / f"{part.name}.jsonl", folder)
-        if index in (0, 1, len(parts) - 1) or "study" in name:
-            write_pages(config, parts)
 
 
 # Whole experiments

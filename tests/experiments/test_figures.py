@@ -10,6 +10,7 @@ from matplotlib.collections import FillBetweenPolyCollection, LineCollection, Pa
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from PIL import Image
+from support.tiers import params_by_tier
 
 from jaxnav.choices import Form
 from jaxnav.evaluation.statistics import Interval
@@ -201,7 +202,7 @@ def test_the_effects_figure_fills_markers_whose_interval_excludes_zero():
     assert first.texts[0].get_text() == "+3.0 [+2.0, +4.0]"
 
 
-@pytest.mark.parametrize("name", DRAWINGS)
+@pytest.mark.parametrize("name", params_by_tier(DRAWINGS, fast=["epsilon"], slow=DRAWINGS))
 def test_equal_data_gives_equal_bytes(name, tmp_path):
     figure = DRAWINGS[name]()
     paths = [tmp_path / file for file in ("first.png", "again.png", "redrawn.png")]
@@ -214,7 +215,7 @@ def test_equal_data_gives_equal_bytes(name, tmp_path):
         assert not set(png.info) - {"dpi"}  # neither a date nor a version
 
 
-@pytest.mark.parametrize("name", DRAWINGS)
+@pytest.mark.parametrize("name", params_by_tier(DRAWINGS, fast=["epsilon"], slow=DRAWINGS))
 def test_all_text_is_inside_the_figure(name):
     figure = DRAWINGS[name]()
     box = figure.get_tightbbox()  # inches

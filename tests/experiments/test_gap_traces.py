@@ -294,6 +294,7 @@ def sample_step(policy_index, episode, time, pose, logits):
     return action, ENV.next_pose(pose, action, ENV_PARAMS)
 
 
+@pytest.mark.slow
 def test_traces_are_those_of_a_plain_loop():
     traces = walk(WEIGHTS)
     assert traces.gap.shape == (3, 2, 2, len(EPISODES.pose), NUM_STEPS + 1)

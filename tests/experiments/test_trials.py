@@ -230,6 +230,7 @@ def test_sum_by_scene_leaves_out_scenes_without_episodes():
 # Measurements
 
 
+@pytest.mark.slow
 def test_variants_are_those_of_an_evaluation(make_bench, evaluated):
     bench = make_bench()
     table = ResultTable(measure_variants(bench, bench.find_run("rooms", "main"), 0.0))

@@ -73,11 +73,13 @@ def test_what_removal_leaves_is_the_layout_blind_policy_to_the_bit():
     assert np.abs(knowing.logits - unknowing.logits).max() > 0.1
 
 
+@pytest.mark.slow
 def test_without_removal_the_policy_with_experience_acts():
     row = table_row("layout", None, None, "argmax")
     alike(outcome(PAIR, BOTH, row), outcome(AgentLoop(ENV, tiny.SPEC, tiny.ESTIMATOR), AGENT, row))
 
 
+@pytest.mark.slow
 def test_under_tde_the_layout_blind_policy_acts(layout_blind):
     alike(outcome(PAIR, BOTH, table_row("tde", None, None, "argmax")), layout_blind)
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from flax import nnx
 from support.scenes import CATEGORIES
+from support.tiers import params_by_tier
 from support.tiny_world import BANK, SIZES, SPEC, decide, leaves_at, random_params
 
 from jaxnav.causal import do
@@ -183,7 +184,7 @@ def test_layout_weights_have_no_gradient(org):
     assert abs(float(loss(LAYOUT_WEIGHTS) - loss(2 * LAYOUT_WEIGHTS))) > 1e-3  # though the weights do matter
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", params_by_tier(METHODS, fast=["org", "rgb"], slow=METHODS))
 def test_only_methods_without_a_mechanism_in_z_have_no_experience(method):
     spec = dataclasses.replace(SPEC, method=find_method(method), method_sizes=())
     assert METHODS[method].experience.is_empty == (bind(spec, init_params(spec, jax.random.key(0))).method.width == 0)

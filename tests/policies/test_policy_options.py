@@ -92,6 +92,7 @@ def test_the_detection_of_the_goal_reaches_it_unless_it_sees_none(direct):
     assert (one.goal != other.goal).any(axis=1).tolist() == [name != "none"] * BATCH
 
 
+@pytest.mark.slow
 def test_the_detection_of_the_goal_enters_in_one_place_whatever_is_sought():
     """Goals that look alike and are detected alike have equal rows there."""
     outputs, appearance = SIZES.row_outputs, SIZES.appearance

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support import tiny_world as tiny
 from support.rollouts import ENV, KNOWLEDGE, PARAMS
+from support.tiers import params_by_tier
 
 import jaxnav
 from jaxnav.causal import do
@@ -148,7 +149,7 @@ def endless_readings(memory, walk):
     return np.array(readings)
 
 
-@pytest.mark.parametrize("headings", [4, 8, 12])
+@pytest.mark.parametrize("headings", params_by_tier([4, 8, 12], fast=[12], slow=[4, 8]))
 @pytest.mark.parametrize("turn_prob", [0.0, 0.1])
 def test_a_walk_longer_than_the_map_is_read_as_on_a_map_without_edges(headings, turn_prob):
     memory = SpatialMemory(headings, size=32)

@@ -115,7 +115,7 @@ def assert_bit_identical(actual, desired):
 
 
 @pytest.mark.parametrize(
-    "method_name", params_by_tier(HOSTS, fast=["org", "anonymous"], slow=["support.methods:ADAPTIVE", "vtnet"])
+    "method_name", params_by_tier(HOSTS, fast=["org"], slow=["anonymous", "support.methods:ADAPTIVE", "vtnet"])
 )
 def test_tde_of_streams_is_bit_identical_to_the_direct_stream(method_name):
     for seed in range(4):

@@ -223,6 +223,7 @@ def test_actor_step_descends_the_cross_entropy_at_repeated_poses(options):
     assert not actor_step[~is_repeated].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("num_decisions", "is_kept"), [(49, True), (50, False), (0, False)])
 def test_actor_change_is_reset_every_fifty_decisions(num_decisions, is_kept):
     policy, pathways, memory = random_policy_inputs(SPEC, num_decisions)

@@ -186,6 +186,7 @@ def test_position_codes_are_distinct():
     assert distance[~np.eye(25, dtype=bool)].min() > 0.3
 
 
+@pytest.mark.slow
 def test_intervention_keeps_the_queries_of_the_view():
     """The view asks within experience: do(scene=0, goal=0) leaves that, and its answer still depends on the view."""
     num_categories = len(CATEGORIES)

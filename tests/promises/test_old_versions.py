@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from support.commands import contents, evaluate, refusal, train
 from support.mutations import resigned
+from support.tiers import params_by_tier
 from support.tiny_run import DRAWN_ESTIMATOR, tiny_config, write_config
 from support.tiny_world import random_params
 
@@ -134,6 +135,7 @@ def test_eval_refuses_a_run_of_0_2_with_former_relations_and_leaves_it_unchanged
     assert contents(run_of_0_2) == before
 
 
+@pytest.mark.slow
 def test_train_refuses_a_checkpoint_of_0_2_by_its_version(run_of_0_2, tmp_path, capsys):
     before = contents(run_of_0_2)
     settings_of_0_2 = ("--direct", "all", "--layout.weights", "raw")
@@ -200,7 +202,7 @@ def decide_once(policy: jaxnav.LoadedPolicy) -> jax.Array:
     return policy.decide(observation, policy.init("kitchen"), heading=0, moved=False, horizon=0).logits
 
 
-@pytest.mark.parametrize("method", ["rgb", "anonymous", "sp"])
+@pytest.mark.parametrize("method", params_by_tier(["rgb", "anonymous", "sp"], fast=["rgb"], slow=["anonymous", "sp"]))
 def test_policies_of_0_3_of_other_methods_keep_their_meaning(tmp_path, method):
     folder = export_tiny_policy(tmp_path / "raw", method, "raw")
     new_policy = jaxnav.load_policy(folder)

@@ -125,6 +125,7 @@ def values(t: Transition) -> dict[tuple[int, int], np.ndarray]:
     return {key: np.asarray(t.value[(t.episode_length - 1 == key[0]) & (t.goal == key[1])]) for key in keys}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_ppo_learns_value_and_choice_of_each_probe(rollouts, name):
     case = CASES[name]

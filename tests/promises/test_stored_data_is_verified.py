@@ -249,7 +249,7 @@ def find_largest_array_file(checkpoint_dir):
 @pytest.mark.parametrize(
     "damage_checkpoint",
     [
-        lambda folder: (folder / "_CHECKPOINT_METADATA").write_text("{"),
+        pytest.param(lambda folder: (folder / "_CHECKPOINT_METADATA").write_text("{"), marks=pytest.mark.slow),
         pytest.param(lambda folder: (folder / "state/_METADATA").unlink(), marks=pytest.mark.slow),
         pytest.param(lambda folder: (folder / "state/_METADATA").write_text(""), marks=pytest.mark.slow),
         lambda folder: flip_bit(find_largest_array_file(folder)),

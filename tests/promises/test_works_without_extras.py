@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from support.tiers import params_by_tier
 
 from jaxnav.__main__ import COMMANDS
 
@@ -41,7 +42,11 @@ def test_every_name_and_help_works_without_extras(tmp_path):
     assert (done.returncode, done.stderr) == (0, "imported\n[]\n")
 
 
-@pytest.mark.parametrize("command", ["episode run", "report run", "scenes show rooms", "study study_quick"])
+#: Commands that draw.
+DRAWING_COMMANDS = ["episode run", "report run", "scenes show rooms", "study study_quick"]
+
+
+@pytest.mark.parametrize("command", params_by_tier(DRAWING_COMMANDS, fast=DRAWING_COMMANDS[:1], slow=DRAWING_COMMANDS))
 def test_drawing_command_is_refused_without_extras(tmp_path, command):
     script = f"from jaxnav.__main__ import main\nsys.exit(main({command.split()}))"
     done = without_pictures(script, tmp_path)

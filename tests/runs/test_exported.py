@@ -124,6 +124,7 @@ def assert_programs_agree(result, expected, rounding_step=0.0):
         np.testing.assert_allclose(result[name], expected[name], rtol=1e-4, atol=tolerance, err_msg=name)
 
 
+@pytest.mark.slow
 def test_model_card_program_runs_with_jax_alone(drawn_run, tmp_path):
     out_dir = tmp_path / "out"
     options = ["--format", "stablehlo", "--policy", "layout-1", "--out", str(out_dir)]

@@ -105,6 +105,7 @@ def instance_counts(row: np.ndarray) -> np.ndarray:
     return row[4 * NUM_CATEGORIES + 31 :][:NUM_CATEGORIES].astype(np.int64)
 
 
+@pytest.mark.slow
 def test_prior_is_one_for_all_rooms_from_ones_and_every_view_of_the_walks():
     world = paper_world()
     alpha = np.ones((NUM_CATEGORIES, NUM_CATEGORIES))

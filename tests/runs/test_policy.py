@@ -120,7 +120,8 @@ def test_loaded_policy_acts_as_in_the_evaluation(drawn_run, world, variant, epsi
         assert actions == trace.action.tolist()
 
 
-@pytest.mark.parametrize("setting", ["overdue", pytest.param("learned", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("setting", ["overdue", "learned"])
 def test_handover_policy_switches_as_in_the_evaluation(drawn_run, world, setting):
     """The policy switches and holds: once without experience, always without."""
     epsilon = 0.6

@@ -57,7 +57,7 @@ def test_sweep_removes_nothing_from_epsilon_1_on(swept, evaluated, decoding):
     assert (swept[decoding].outcome.length[0] != row.length).any()  # what is removed at epsilon 0 matters here
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_sweep_evaluates_the_given_parameters(swept, drawn_run):
     params = drawn_run.policies(("layout",)).params
     repeated_outcomes = {

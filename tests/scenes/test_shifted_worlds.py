@@ -135,6 +135,7 @@ def detection_ranges(scenes: list[Scene]) -> dict[str, list[float]]:
     return ranges
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", EVERY_WORLD)
 def test_layout_shift_keeps_detection_ranges_of_categories(world):
     ranges_before = detection_ranges(shifted_scenes(world, 0.0))
@@ -175,8 +176,7 @@ def test_layout_shift_leaves_the_training_distribution(world: str):
     assert permutation_test(training_scenes, shifted_scenes(world, 1.0), categories, rng) < 0.01
 
 
-@pytest.mark.parametrize("world", EVERY_WORLD)
-@pytest.mark.slow
+@pytest.mark.parametrize("world", params_by_tier(WORLDS, slow=["rooms"]))
 def test_full_layout_shift_reduces_related_pairs_to_chance(world: str):
     categories = WORLDS[world].task.categories
     # The pairs are selected in other scenes, for the highest of many lifts are partly luck.

@@ -5,6 +5,7 @@ import itertools
 
 import jax
 import numpy as np
+import pytest
 from support import tiny_world as tiny
 
 from jaxnav.env.make import build_environment
@@ -96,6 +97,7 @@ def test_rooms_without_scenes_have_no_counts():
     assert not counts[sorted(set(range(NUM_PRIORS)) - {KITCHEN, BEDROOM})].any()
 
 
+@pytest.mark.slow
 def test_done_is_never_chosen():
     """Episodes start in the kitchen, and Done, nothing else, leads from everywhere to the bedroom."""
     only = {name: getattr(PARAMS.tables, name)[:1] for name in ("first_cell", "num_cells", "goals", "num_goals")}

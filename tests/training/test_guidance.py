@@ -59,7 +59,8 @@ def test_guidance_adds_the_weighted_cross_entropy_to_shortest_paths():
     assert set(terms) - set(plain_terms) == {"imitation_loss", "imitation_agreement"}
 
 
-@pytest.mark.parametrize(("final_guidance", "expected"), [pytest.param(None, 0.8, marks=pytest.mark.slow), (0.0, 0.6)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("final_guidance", "expected"), [(None, 0.8), (0.0, 0.6)])
 def test_guidance_goes_to_its_final_weight_within_a_stage(final_guidance, expected):
     """Update 1 of 4: a quarter of the way from 0.8 to 0 is 0.6; without a final weight it stays 0.8."""
     config = guided_ppo(guidance=0.8, final_guidance=final_guidance, learning_rate=0.0, epochs=1, minibatches=1)

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import os
-from concurrent.futures import ThreadPoolExecutor
 
 import chex
 import jax
@@ -54,22 +53,15 @@ def seeds():
 
 
 @pytest.fixture(scope="module")
-def chunks(seeds):
-    """Both seeds after one update, and the first one, alone, after two; compiled side by side."""
-    with ThreadPoolExecutor() as pool:
-        one = pool.submit(one_update, seeds, SCALARS, PARAMS, KNOWLEDGE)
-        two = pool.submit(two_updates, tiny.leaves_at(seeds, 0), SCALARS, PARAMS, KNOWLEDGE)
-        return one.result(), two.result()
+def first(seeds):
+    """Both seeds after one update."""
+    return one_update(seeds, SCALARS, PARAMS, KNOWLEDGE)
 
 
 @pytest.fixture(scope="module")
-def first(chunks):
-    return chunks[0]
-
-
-@pytest.fixture(scope="module")
-def whole(chunks):
-    return chunks[1]
+def whole(seeds):
+    """The first seed, alone, after two updates."""
+    return two_updates(tiny.leaves_at(seeds, 0), SCALARS, PARAMS, KNOWLEDGE)
 
 
 def assert_same(a, b):
@@ -80,6 +72,7 @@ def kernel(states):
     return np.asarray(states.params["fuse"]["kernel"])
 
 
+@pytest.mark.slow
 def test_two_chunks_beside_another_seed_are_one_chunk_alone_bit_for_bit(first, whole):
     second = one_update(first[0], SCALARS, PARAMS, KNOWLEDGE)
     assert_same(tiny.leaves_at(second[0], 0), whole[0])
@@ -118,6 +111,7 @@ def test_another_seed_gives_another_policy(first, seeds):
     assert not np.array_equal(kernel(one_update(rekeyed, SCALARS, PARAMS, KNOWLEDGE)[0])[0], kernel(first[0])[0])
 
 
+@pytest.mark.slow
 def test_metrics_are_finite_scalars(whole):
     metrics = whole[1]
     assert metrics.keys() == METRICS

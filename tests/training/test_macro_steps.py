@@ -25,6 +25,7 @@ CORRIDOR = corridor_scene(40)
 BANK, LIMIT = compile_bank([CORRIDOR], Task(CATEGORIES)), 26
 
 
+@pytest.mark.slow
 def test_choices_that_do_not_count_teach_no_policy():
     """Neither what was chosen there nor how well it went moves anything but the value, which learns everywhere."""
     before = rolled(False)

@@ -114,7 +114,7 @@ def test_near_log_odds_of_a_world():
         np.testing.assert_allclose(log_odds[params.room[scene], :, first, second], 0.0, atol=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_near_log_odds_separate_layouts_in_new_homes():
     """Fitted to 24 houses, the gap of walks in 12 others is larger where their categories have exchanged places."""
     task = WORLDS["houses"].task

@@ -95,7 +95,8 @@ def test_experience_coin_is_constant_within_an_episode():
         np.testing.assert_array_equal(next_rollout.initial_memory.use_experience[running], last_coins[running])
 
 
-@pytest.mark.parametrize("experience_prob", [0.25, pytest.param(0.8, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("experience_prob", [0.25, 0.8])
 def test_experience_coin_has_the_configured_probability(experience_prob):
     learner = make_learner("org", experience=experience_prob)
     learner = dataclasses.replace(learner, config=dataclasses.replace(learner.config, num_envs=1024))
@@ -118,9 +119,10 @@ def test_experience_coin_has_the_configured_probability(experience_prob):
     np.testing.assert_array_equal(last_coins[~is_new_episode], first_coins[~is_new_episode])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("drawn", "expected_share"),
-    [("episode", 0.0), pytest.param("step", pytest.approx(0.5, abs=0.25), marks=pytest.mark.slow)],
+    [("episode", 0.0), ("step", pytest.approx(0.5, abs=0.25))],
 )
 def test_experience_coin_changes_within_an_episode_only_if_drawn_every_step(drawn, expected_share):
     learner = make_learner("org", experience=0.5, experience_drawn=drawn)

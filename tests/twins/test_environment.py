@@ -230,7 +230,12 @@ def count_table_differences(scene: Scene, guide: Guide, task: Task, stride: int 
 @pytest.mark.parametrize("world", TASKS)
 @pytest.mark.parametrize(
     ("source", "stride"),
-    [("coarse", 1), pytest.param("maze", 2, marks=SLOW), ("rooms", 3), pytest.param("ithor", 3, marks=SLOW)],
+    [
+        pytest.param("coarse", 1, marks=SLOW),
+        pytest.param("maze", 2, marks=SLOW),
+        ("rooms", 3),
+        pytest.param("ithor", 3, marks=SLOW),
+    ],
 )
 def test_tables_equal_the_twin_at_every_pose(source, stride, world):
     task = TASKS[world]
@@ -253,7 +258,10 @@ def test_tables_of_a_real_apartment_equal_the_twin(world):
 
 
 @pytest.mark.parametrize("world", TASKS)
-@pytest.mark.parametrize(("source", "stride"), [("coarse", 3), ("maze", 2), ("rooms", 3), ("ithor", 3)])
+@pytest.mark.parametrize(
+    ("source", "stride"),
+    [pytest.param("coarse", 3, marks=SLOW), pytest.param("maze", 2, marks=SLOW), ("rooms", 3), ("ithor", 3)],
+)
 def test_best_lengths_equal_the_search_of_the_twin(source, stride, world):
     task = TASKS[world]
     rng = np.random.default_rng(0)

@@ -233,7 +233,7 @@ def weights_of_sum_one(method: str) -> type[TwinMethod]:
     return Raw
 
 
-@pytest.mark.parametrize("strength", [5.0, None])
+@pytest.mark.parametrize("strength", [5.0, pytest.param(None, marks=pytest.mark.slow)])
 def test_decisions_of_the_setting_paper_are_the_twins(strength):
     """Equations 1 to 7 with instance counts, from a weak prior with large gaps and from the counts themselves."""
     setting = dataclasses.replace(ESTIMATORS["paper"], strength=strength)

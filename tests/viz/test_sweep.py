@@ -16,6 +16,7 @@ def sweeps(tmp_path_factory):
     return sweep_shifts(run, EPSILON, (0.0, 1.0), episodes=24)
 
 
+@pytest.mark.slow
 def test_curves_are_the_rows_in_rising_order_of_the_threshold(sweeps):
     figure = sweep_figure(sweeps)
     axes_of_sr = figure.axes[0]
@@ -32,6 +33,7 @@ def test_curves_are_the_rows_in_rising_order_of_the_threshold(sweeps):
     assert len(axes_of_sr.collections) == len(sweeps)
 
 
+@pytest.mark.slow
 def test_axes_of_percent_start_at_0_and_those_of_changes_are_symmetric(sweeps):
     sr_axes, spl_axes, sr_change_axes, spl_change_axes = sweep_figure(sweeps).axes
     for axes in (sr_axes, spl_axes):
@@ -43,6 +45,7 @@ def test_axes_of_percent_start_at_0_and_those_of_changes_are_symmetric(sweeps):
     assert bottom == -top <= -1
 
 
+@pytest.mark.slow
 def test_title_names_method_and_episodes(sweeps):
     (sweep, _) = sweeps
     title = sweep_figure(sweep).axes[0].get_title(loc="left")

@@ -23,6 +23,7 @@ MEASURED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("room_type", ROOM_TYPES)
 def test_generated_room_statistics_follow_the_measured_ones(rooms: list[Scene], room_type: str):
     quartiles, mean_instances, mean_targets, fill_share = MEASURED[room_type]
@@ -58,6 +59,7 @@ PRESENCE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("room_type", "target"), PRESENCE)
 def test_generated_room_presence_and_height_follow_the_measured_ones(rooms: list[Scene], room_type: str, target: str):
     presence_share, median_height = PRESENCE[room_type, target]
@@ -105,6 +107,7 @@ PAIRS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("room_type", "type_name", "neighbour"), PAIRS)
 def test_generated_rooms_place_related_objects_near_each_other(
     rooms: list[Scene], room_type: str, type_name: str, neighbour: str
@@ -112,6 +115,7 @@ def test_generated_rooms_place_related_objects_near_each_other(
     assert neighbour_lift(of_type(rooms, room_type), type_name, neighbour) > 1.5
 
 
+@pytest.mark.slow
 def test_neighbour_lift_of_shuffled_rooms_is_one(rooms: list[Scene]):
     rng = np.random.default_rng(0)
     shuffled_rooms = [shuffle_places(scene, rng) for scene in rooms]

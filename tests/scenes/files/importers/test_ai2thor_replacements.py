@@ -221,7 +221,7 @@ def test_read_replacements_restores_real_heights_from_pivots(tmp_path):
     assert np.mean(np.array(height_errors) <= 0.02) >= 0.95
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_replaced_real_rooms_keep_nearly_all_categories_reachable():
     num_present = 0
     num_reachable = 0
