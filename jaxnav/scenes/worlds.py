@@ -89,7 +89,7 @@ WORLDS = {
         large_step_limit=500,
         shaping=1.0,
         near_starts=0.5,
-        guidance=0.0,
+        guidance=0.03,
         budgets=(50, 150),
     ),
     "houses": World(
