@@ -34,6 +34,8 @@ from jaxnav.scenes.tables.observation_row import RowFormat
 DIFFICULTY_MEASURES = ("best_length", "random_sr", "frontier_sr", "start_distance")
 #: Measures that may differ between categories, but that the shift must not change in any of them.
 CATEGORY_MEASURES = ("goal_detected", "done_succeeds")
+#: Measures of the layout: scenes with co-occurrence weigh alike. All other measures weigh scenes by their episodes.
+LAYOUT_MEASURES = ("layout_gap", "layout_similarity")
 BASELINE_MEASURES = ("baseline_argmax_sr", "baseline_sample_sr")
 #: Measures of layout-blind agents, which a shift cannot mislead.
 LAYOUT_BLIND_MEASURES = (
@@ -147,11 +149,11 @@ def measure_scenes(
         values["layout_blind_argmax_wrong"] = sum_by_scene(argmax_wrong)
         values["layout_blind_sample_wrong"] = sum_by_scene(sample_wrong)
 
-    # Layout measures weigh every scene with co-occurrence once, all others weigh scenes by their episodes.
+    # Weights of the scenes in the mean of every measure.
     has_cooccurrence = (~np.isnan(scenes.gap)).astype(np.float64)
     weights: dict[str, np.ndarray] = {}
     for measure in values:
-        weights[measure] = has_cooccurrence if measure.startswith("layout") else episode_counts
+        weights[measure] = has_cooccurrence if measure in LAYOUT_MEASURES else episode_counts
 
     # Room types in the order of the scenes, bank by bank.
     room_types: list[str] = []

@@ -5,10 +5,13 @@ import re
 
 import numpy as np
 import pytest
+from rich.console import Console
 from support.intervals import around, bounds
 from support.scenes import draw
 
 from jaxnav.errors import InputError
+from jaxnav.evaluation.episodes import join_episode_lists
+from jaxnav.evaluation.grid import EpisodeOutcome
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.experiments.config import ExperimentConfig
 from jaxnav.experiments.instrument import (
@@ -19,12 +22,38 @@ from jaxnav.experiments.instrument import (
     SceneTotals,
     compare_shifts,
     measure_detection,
+    measure_scenes,
 )
 from jaxnav.experiments.pages import render_page
 from jaxnav.experiments.table import ResultTable
+from jaxnav.runs.policies import load_policies
+from jaxnav.runs.worlds import compile_evaluation_world, draw_episode_lists
 from jaxnav.scenes.tables.compile import categories_in_view, compile_bank, compile_scene
 from jaxnav.scenes.tables.observation_row import PERFECT_DETECTOR, Detector, RowFormat
 from jaxnav.scenes.task import Rules, Task
+
+# Measures of one shift
+
+
+def test_agents_that_always_succeed_have_a_success_of_100_percent(drawn_run, monkeypatch):
+    def succeed(rows, policies, world, num_episodes, seed):
+        episode_lists = draw_episode_lists(world, num_episodes, seed)
+        shape = (len(rows), policies.num_seeds, len(join_episode_lists(episode_lists).goal))
+        outcome = EpisodeOutcome.zeros(shape)._replace(
+            done=np.ones(shape, bool), success=np.ones(shape, bool), length=np.ones(shape, int)
+        )
+        return episode_lists, outcome, 1
+
+    monkeypatch.setattr("jaxnav.experiments.instrument.evaluate_rows", succeed)
+    world = compile_evaluation_world(drawn_run.config, "val", None, 0.0, Console(quiet=True))
+    policies = load_policies(drawn_run.config, ("baseline",))
+    totals = measure_scenes(world, policies, policies, num_episodes=24, seed=0)
+
+    # Some four episodes a scene, so sums and means of the scenes differ.
+    for measure in (*BASELINE_MEASURES, "layout_blind_argmax_sr", "layout_blind_sample_sr"):
+        means = totals.values[measure].sum(axis=1) / totals.weights[measure].sum()
+        np.testing.assert_allclose(means, 100.0)
+
 
 # Comparison of shifts
 
