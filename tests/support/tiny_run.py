@@ -6,8 +6,6 @@ Two seeds of two arms on four rooms of each split, so a training takes seconds:
 """
 
 import dataclasses
-import fcntl
-import os
 from pathlib import Path
 from typing import Any
 
@@ -66,23 +64,16 @@ def tiny_config(folder: Path, **changes: Any) -> RunConfig:
 def finished_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Return the config file and the directory of a run that the train command has finished.
 
-    The run is trained once for all tests and workers of a session. The directory also holds the temporary file that a
-    process leaves when it is killed while it writes the config.
+    The run is trained once for all tests of a session. The directory also holds the temporary file that a process
+    leaves when it is killed while it writes the config.
     """
-    session_dir = tmp_path_factory.getbasetemp()
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        session_dir = session_dir.parent
-    folder = session_dir / "finished"
+    folder = tmp_path_factory.getbasetemp() / "finished"
     config_file = folder / "tiny.yaml"
     run_dir = folder / "run"
-
-    # The first worker trains, and all others wait for it.
-    with (session_dir / "finished.lock").open("w") as lock_file:
-        fcntl.flock(lock_file, fcntl.LOCK_EX)
-        if not folder.exists():
-            run_dir.mkdir(parents=True)
-            (run_dir / ".config.json.123.tmp").write_text("{")
-            assert train(write_config(folder), run_dir) == 0
+    if not folder.exists():
+        run_dir.mkdir(parents=True)
+        (run_dir / ".config.json.123.tmp").write_text("{")
+        assert train(write_config(folder), run_dir) == 0
     return config_file, run_dir
 
 
