@@ -105,7 +105,7 @@ def test_trainer_restart_draws_new_episodes_and_keeps_the_learner(world):
     assert (np.asarray(after.agent.state.scene) < len(world.banks[1].names)).all()
 
 
-@pytest.mark.exhaustive
+@pytest.mark.slow
 def test_streamed_run_resumes_bit_for_bit(finished, config_file, cache, tmp_path, monkeypatch, capsys):
     """8 updates in chunks of 2 go through four turns of three shards; the second half comes after a stop."""
     stopped = tmp_path / "stopped"

@@ -29,7 +29,7 @@ def assert_told(code, message):
     assert message.splitlines()[-1].startswith("error: config: devices: another process of this run ended, cannot be")
 
 
-@pytest.mark.exhaustive
+@pytest.mark.slow
 def test_two_processes_train_the_run_of_one(tmp_path, capsys):
     config_file, one, two = write_config(tmp_path), tmp_path / "one", tmp_path / "two"
     assert train(config_file, one, "--seeds", 1) == 0
