@@ -104,15 +104,16 @@ class Bench:
             run.config, self.config.split, None, shift, self.console, shift_by=self.config.shift_by
         )
 
-    def draw_episodes(self, world: CompiledWorld) -> EpisodeList:
-        """Draw the episodes of the experiment in a world.
+    def draw_episodes(self, world: CompiledWorld, num_folds: int = 1) -> EpisodeList:
+        """Draw the episodes of the experiment in a world, or the share of one of several folds.
 
         Raises:
           InputError: the scenes fill more than one shard.
         """
         if len(world.banks) > 1:
             raise InputError("takes as many scenes of a split as fit into one shard; give more worlds.shard_scenes")
-        return draw_episodes(world.banks[0], self.config.episodes, self.config.seed)
+        num_episodes = -(-self.config.episodes // num_folds)  # rounded up
+        return draw_episodes(world.banks[0], num_episodes, self.config.seed)
 
     def evaluate(self, run: AgentRun, shift: float) -> Scores:
         """Train a run if necessary, and evaluate its variants as `jaxnav eval` does."""

@@ -41,6 +41,9 @@ class ExperimentConfig:
       pages: pages to write, as YAML that maps each Markdown document to its template: a file, or one of the packaged
         templates account, claims, factors, instrument, methods, mixture, paper and study.
       worlds: worlds by name, as YAML. Each maps settings of `jaxnav train` to the values of all runs in that world.
+      folds: datasets that are divided into folds, as YAML that maps the name of a dataset to a list of its worlds. Each
+        of these worlds evaluates one fold with agents trained on other scenes of the dataset. The measurements
+        `mixture`, `handover` and `cde` evaluate all folds together, and divide the episodes among them.
       agents: agents by name, as YAML. Each maps settings of `jaxnav train` to the values of its runs. The key `against`
         lists agents to compare with: AGENT compares equal variants, AGENT/VARIANT always compares with that variant,
         such as `org/baseline`. The key `run` names a finished run to use instead of training one.
@@ -83,6 +86,7 @@ class ExperimentConfig:
     runs: Path = Path("runs/experiment")
     pages: dict[str, str] = dataclasses.field(default_factory=dict)
     worlds: dict[str, dict[str, Any]] = dataclasses.field(default_factory=lambda: {"rooms": {"world": "rooms"}})
+    folds: dict[str, Any] = dataclasses.field(default_factory=dict)
     agents: dict[str, dict[str, Any]] = dataclasses.field(default_factory=lambda: {"main": {}})
     left_out: tuple[str, ...] = ()
     only: tuple[str, ...] = ("*",)
@@ -123,6 +127,7 @@ class AgentRun(NamedTuple):
       config: settings of the run.
       against: names of the agents with which it is compared.
       is_external: True if the run was given as a finished one, and is not trained by the experiment.
+      folds: runs of all folds, if this stands for an agent in a dataset; `config` is that of the first.
     """
 
     world: str
@@ -130,11 +135,17 @@ class AgentRun(NamedTuple):
     config: RunConfig
     against: tuple[str, ...] = ()
     is_external: bool = False
+    folds: tuple["AgentRun", ...] = ()
 
     @property
     def name(self) -> str:
         """Name of the run in its folder."""
         return f"{self.world}-{self.agent}".replace(":", "-")
+
+    @property
+    def fold_runs(self) -> tuple["AgentRun", ...]:
+        """Runs of all folds; the run itself without any."""
+        return self.folds or (self,)
 
 
 def check_experiment(config: ExperimentConfig) -> ExperimentConfig:
@@ -169,9 +180,10 @@ def check_experiment(config: ExperimentConfig) -> ExperimentConfig:
         raise InputError("decodings: empty: give one or more")
 
     # Names become parts of file names, and a slash separates an agent from its variant.
-    for name in (*config.worlds, *config.agents):
+    for name in (*config.worlds, *config.folds, *config.agents):
         if not re.fullmatch(r"[\w.+:-]+", name):
             raise InputError(f"worlds and agents: {name!r}: is part of file names; give letters, digits, '-' and '_'")
+    _check_folds(config)
     for measurement, patterns in config.measure.items():
         if not isinstance(patterns, list) or not all(isinstance(pattern, str) for pattern in patterns):
             raise InputError(f"measure.{measurement}: {patterns}: give a list of agents, or ['*']")
@@ -198,6 +210,25 @@ def check_experiment(config: ExperimentConfig) -> ExperimentConfig:
         if run_names.count(name) > 1:
             raise InputError(f"worlds and agents: two runs are called {name}; give other names")
     return config
+
+
+def _check_folds(config: ExperimentConfig) -> None:
+    """Check that folds are worlds of the experiment, each of one dataset."""
+    all_folds: list[str] = []
+    for dataset, folds in config.folds.items():
+        if not isinstance(folds, list) or not folds:
+            raise InputError(f"folds.{dataset}: {folds!r}: give a list of worlds")
+        if dataset in config.worlds:
+            raise InputError(f"folds.{dataset}: a world is called so too; give another name")
+        for fold in folds:
+            if fold not in config.worlds:
+                raise InputError(
+                    f"folds.{dataset}: {fold!r} is none of the worlds; choose from {', '.join(config.worlds)}"
+                )
+        all_folds += folds
+    # Scenes of a fold that is listed twice would count twice.
+    if len(set(all_folds)) < len(all_folds):
+        raise InputError("folds: a world is listed twice; give each once")
 
 
 def _check_seeds(runs: list[AgentRun]) -> None:
@@ -329,6 +360,22 @@ def measured_runs(config: ExperimentConfig, measurement: str) -> list[AgentRun]:
     return runs
 
 
+def join_folds(config: ExperimentConfig, runs: list[AgentRun]) -> list[AgentRun]:
+    """Replace the runs of an agent in the folds of a dataset by one that stands for all of them."""
+    # A dataset is measured as a whole, even if `only` selects a single fold.
+    run_by_name = {(run.world, run.agent): run for run in agent_runs(config)}
+    dataset_by_fold = {fold: dataset for dataset, folds in config.folds.items() for fold in folds}
+    joined: dict[tuple[str, str], AgentRun] = {}
+    for run in runs:
+        dataset = dataset_by_fold.get(run.world)
+        if dataset is None:
+            joined[run.world, run.agent] = run
+            continue
+        fold_runs = tuple(run_by_name[fold, run.agent] for fold in config.folds[dataset])
+        joined[dataset, run.agent] = fold_runs[0]._replace(world=dataset, folds=fold_runs)
+    return list(joined.values())
+
+
 def evaluation_settings(config: ExperimentConfig) -> dict[str, Any]:
     """Return the settings of the evaluation as JSON."""
     settings = {}
@@ -351,8 +398,13 @@ def part_settings(config: ExperimentConfig, run: AgentRun, references: list[Agen
     from jaxnav.runs.run import comparable_settings
 
     settings = evaluation_settings(config) | {"run": comparable_settings(run.config)}
+    if run.folds:
+        settings["folds"] = {fold.world: _digest(comparable_settings(fold.config)) for fold in run.folds}
     if references:
-        digests = {reference.agent: _digest(comparable_settings(reference.config)) for reference in references}
+        digests = {}
+        for reference in references:
+            reference_name = reference.name if run.folds else reference.agent
+            digests[reference_name] = _digest(comparable_settings(reference.config))
         settings["references"] = digests
     return settings
 

@@ -18,6 +18,7 @@ from jaxnav.experiments.config import (
     ExperimentConfig,
     check_experiment,
     evaluation_settings,
+    join_folds,
     matches_any,
     measured_runs,
     part_settings,
@@ -63,12 +64,22 @@ class Measurement(NamedTuple):
       parts: setting of the experiment whose values are measured in parts of their own.
       references: names of the agents that a run is compared with.
       compares_shifts: True if it compares layout shifts, and so needs several.
+      compares_removals: True if it compares removals: `removals` selects some, and the folds of a dataset are evaluated
+        together.
     """
 
     measure: Callable[..., Iterator[ResultRow]]
     parts: str | None = None
     references: Callable[[ExperimentConfig, AgentRun], list[str]] = _no_agents
     compares_shifts: bool = False
+    compares_removals: bool = False
+
+
+def _removal_measurement(measure: Callable[..., Iterator[ResultRow]]) -> Measurement:
+    """A measurement that compares removals."""
+    return Measurement(
+        measure, parts="decodings", references=_layout_blind_agent, compares_shifts=True, compares_removals=True
+    )
 
 
 MEASUREMENTS = {
@@ -81,12 +92,10 @@ MEASUREMENTS = {
     "growth": Measurement(measure_growth, compares_shifts=True),
     "instrument": Measurement(measure_instrument, references=_layout_blind_agent, compares_shifts=True),
     "gaps": Measurement(measure_gaps, compares_shifts=True),
-    "mixture": Measurement(measure_mixture, parts="decodings", references=_layout_blind_agent, compares_shifts=True),
-    "handover": Measurement(measure_handover, parts="decodings", references=_layout_blind_agent, compares_shifts=True),
-    "cde": Measurement(measure_cde, parts="decodings", references=_layout_blind_agent, compares_shifts=True),
+    "mixture": _removal_measurement(measure_mixture),
+    "handover": _removal_measurement(measure_handover),
+    "cde": _removal_measurement(measure_cde),
 }
-#: Measurements that compare removals, of which `removals` selects some.
-REMOVAL_MEASURES = (measure_mixture, measure_handover, measure_cde)
 
 
 class Part(NamedTuple):
@@ -183,14 +192,18 @@ def list_parts(config: ExperimentConfig, bench: Bench) -> list[Part]:
     parts = []
     for name, measurement in MEASUREMENTS.items():
         runs = measured_runs(config, name) if name in config.measure else []
+        if measurement.compares_removals:
+            runs = join_folds(config, runs)
         for run in runs:
-            references = [bench.find_run(run.world, agent) for agent in measurement.references(config, run)]
+            references = []
+            for fold_run in run.fold_runs:
+                references += [bench.find_run(fold_run.world, agent) for agent in measurement.references(config, run)]
             settings = part_settings(config, run, [reference for reference in references if reference is not None])
             if measurement.measure is measure_evaluation:
                 settings["against"] = list(run.against)
             if measurement.measure is measure_groups:
                 settings["groups"] = config.groups
-            if measurement.measure in REMOVAL_MEASURES and config.removals != ("*",):
+            if measurement.compares_removals and config.removals != ("*",):
                 settings["removals"] = list(config.removals)
             measure = partial(measurement.measure, bench, run)
             if measurement.parts is None:

@@ -42,6 +42,10 @@ from jaxnav.scenes.worlds import WORLDS
 
 Removal = TypeVar("Removal")
 
+#: Decision that remains once experience is removed: that of the run's counterfactual logits, of the layout-blind
+#: agents, or of the same network under do(Z = 0).
+RemainingDecision = Literal["own", "layout-blind", "without experience"]
+
 #: Variants of the agents that removals are compared with.
 LAYOUT_BLIND = "layout-blind agents"
 WITHOUT_REMOVAL = "without removal"
@@ -141,113 +145,170 @@ def measure_cde(
     return _measure_removals(bench, run, decoding, rules, "without experience")
 
 
+class RemovalOutcomes(NamedTuple):
+    """Outcomes of a run and its removals on the E episodes of a mixed population; outcomes have leaves [S, E].
+
+    Attributes:
+      layout_blind: outcome of the layout-blind agents.
+      plain: outcome of the run without removal.
+      hard: outcome of complete removal.
+      fixed: outcomes of the removals that follow no gap, by name.
+      hard_controls: outcomes of the controls of complete removal, by name.
+      rules: outcomes of soft removal, by rule.
+      rule_controls: outcomes of the controls of each rule, by rule and control.
+    """
+
+    layout_blind: EpisodeOutcome
+    plain: EpisodeOutcome
+    hard: EpisodeOutcome
+    fixed: dict[str, EpisodeOutcome]
+    hard_controls: dict[str, EpisodeOutcome]
+    rules: dict[str, EpisodeOutcome]
+    rule_controls: dict[str, dict[str, EpisodeOutcome]]
+
+
 def _measure_removals(
-    bench: Bench,
-    run: AgentRun,
-    decoding: Decoding,
-    rules: Sequence[RemovalRule],
-    direct_policy: Literal["own", "layout-blind", "without experience"],
+    bench: Bench, run: AgentRun, decoding: Decoding, rules: Sequence[RemovalRule], remaining: RemainingDecision
 ) -> Iterator[ResultRow]:
     """Evaluate removals and their controls; see `measure_mixture`.
 
     Args:
       bench, run, decoding, rules: as there.
-      direct_policy: decision that remains once experience is removed: that of the run's counterfactual logits, of the
-        layout-blind agents, or of the same network under do(Z = 0).
+      remaining: decision that remains once experience is removed.
     """
+    budgets = WORLDS[run.config.world].budgets
+    shifts = (bench.config.shifts[0], bench.config.shifts[-1])
+
+    # The folds of a dataset have scenes and policies of their own. Training run s is that of all folds with seed s.
+    populations = []
+    fold_outcomes = []
+    for fold_run in run.fold_runs:
+        population = draw_mixed_population(bench, fold_run, shifts, num_folds=len(run.fold_runs))
+        populations.append(population)
+        fold_outcomes.append(_run_removals(bench, fold_run, population, decoding, rules, remaining))
+    episodes = join_episode_lists([population.episodes for population in populations])
+    shift_index = np.concatenate([population.shift for population in populations])
+    outcomes: RemovalOutcomes = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *fold_outcomes)
+
+    # Values of the agents themselves.
+    metrics = PopulationMetrics(episodes, shift_index, budgets)
+    layout_blind_agent = require_layout_blind_run(bench, run.fold_runs[0]).agent
+    run_names = {
+        "own": run.agent,
+        "layout-blind": f"{run.agent}, handed over to {layout_blind_agent}",
+        "without experience": f"{run.agent}, without experience",
+    }
+    report = _RemovalReport(
+        fields={"world": run.world, "run": run_names[remaining], "decoding": decoding},
+        shifts=shifts,
+        metrics=metrics,
+        layout_blind=metrics.percent_metrics(outcomes.layout_blind),
+        agent=metrics.percent_metrics(outcomes.plain),
+        num_scenes=len(episodes.scenes) // len(shifts),
+    )
+    yield from report.agent_rows()
+    plain_lengths = metrics.by_shift(np.asarray(outcomes.plain.length))
+    for shift, lengths in zip(shifts, plain_lengths, strict=True):
+        yield report.row("length", Interval(float(np.median(lengths))), variant=WITHOUT_REMOVAL, shift=shift)
+
+    # Hard removal, the oracle and the removals that follow no gap need no estimate of the shift from the views.
+    yield from report.removal_rows("CDE" if remaining == "without experience" else "TDE", outcomes.hard)
+    yield from report.removal_rows(ORACLE_NAME, metrics.oracle_removal(outcomes.plain, outcomes.hard))
+    for name, outcome in (outcomes.fixed | outcomes.hard_controls).items():
+        yield from report.removal_rows(name, outcome)
+
+    # Every rule is compared with its own controls and with the best removal that follows no gap. The latter is chosen
+    # on these very episodes, so the comparison favours the control.
+    best_fixed = {}
+    if outcomes.fixed:
+        best_name = max(outcomes.fixed, key=lambda name: report.mixture_gain(outcomes.fixed[name], budgets[-1]))
+        best_fixed = {best_name: outcomes.fixed[best_name]}
+    for name, outcome in outcomes.rules.items():
+        yield from report.removal_rows(name, outcome, outcomes.rule_controls[name] | best_fixed)
+
+
+def _run_removals(
+    bench: Bench,
+    run: AgentRun,
+    population: "MixedPopulation",
+    decoding: Decoding,
+    rules: Sequence[RemovalRule],
+    remaining: RemainingDecision,
+) -> RemovalOutcomes:
+    """Run the removals of a run and their controls in a mixed population; see `_measure_removals`."""
     # Paired comparisons need the same episodes and as many training runs on both sides.
     layout_blind_run = require_layout_blind_run(bench, run)
     bench.train(run)
     bench.train(layout_blind_run)
-    budgets = WORLDS[run.config.world].budgets
-    shifts = (bench.config.shifts[0], bench.config.shifts[-1])
+    world, episodes, _ = population
+    removals = bench.config.removals
     runner = TrialRunner(bench.config.seed)
 
     # Both runs meet the same episodes.
-    world, episodes, shift_index = draw_mixed_population(bench, run, shifts)
     layout_blind = EvaluatedRun(load_policies(layout_blind_run.config, ("baseline",)), world, episodes)
     policies = load_policies(run.config, ("layout",))
-    agent_name = run.agent
-    hard_name = "TDE"
-    match direct_policy:
+    match remaining:
         case "layout-blind":
             policies = policies.with_handover_to(layout_blind.policies)
-            agent_name = f"{run.agent}, handed over to {layout_blind_run.agent}"
         case "without experience":
             policies = policies.with_own_fallback()
-            agent_name = f"{run.agent}, without experience"
-            hard_name = "CDE"
     evaluated_run = EvaluatedRun(policies, world, episodes)
     estimator = require_estimator_config(policies)
 
     # References and removals that follow no gap are evaluated once, for all rules.
     baseline_trial = Trial("baseline", decoding)
     layout_blind_outcome = runner.run_trials(layout_blind, None, [baseline_trial])[baseline_trial]
-    bench.console.print(f"{hard_name} and removals that follow no gap")
-    fixed_trials = select_removals(list_fixed_trials(decoding, budgets[-1]), bench.config.removals)
+    bench.console.print("complete removal and removals that follow no gap")
+    fixed_trials = select_removals(list_fixed_trials(decoding, WORLDS[run.config.world].budgets[-1]), removals)
     plain_trial = Trial("layout", decoding)
     hard_trial = Trial("tde", decoding)
     outcomes = runner.run_trials(evaluated_run, estimator, [plain_trial, hard_trial, *fixed_trials.values()])
-    outcome_by_fixed = {name: outcomes[trial] for name, trial in fixed_trials.items()}
 
-    # Values of the agents themselves.
-    metrics = PopulationMetrics(episodes, shift_index, budgets)
-    report = _RemovalReport(
-        fields={"world": run.world, "run": agent_name, "decoding": decoding},
-        shifts=shifts,
-        metrics=metrics,
-        layout_blind=metrics.percent_metrics(layout_blind_outcome),
-        agent=metrics.percent_metrics(outcomes[plain_trial]),
-        num_scenes=len(episodes.scenes) // len(shifts),
-    )
-    yield from report.agent_rows()
-    plain_lengths = metrics.by_shift(np.asarray(outcomes[plain_trial].length))
-    for shift, lengths in zip(shifts, plain_lengths, strict=True):
-        yield report.row("length", Interval(float(np.median(lengths))), variant=WITHOUT_REMOVAL, shift=shift)
-
-    # Hard removal, the oracle and the removals that follow no gap need no estimate of the shift from the views.
-    yield from report.removal_rows(hard_name, outcomes[hard_trial])
-    yield from report.removal_rows(ORACLE_NAME, metrics.oracle_removal(outcomes[plain_trial], outcomes[hard_trial]))
-    for name, outcome in outcome_by_fixed.items():
-        yield from report.removal_rows(name, outcome)
-
-    # Complete removal with counterfactual logits that know nothing of a part of this episode.
-    if direct_policy == "own":
-        hard_controls = select_removals(HARD_CONTROLS, bench.config.removals)
-        control_trials = {name: Trial("tde", decoding, control=control) for name, control in hard_controls.items()}
+    hard_controls = {}
+    if remaining == "own":
+        # Complete removal with counterfactual logits that know nothing of a part of this episode.
+        control_trials = {}
+        for name, control in select_removals(HARD_CONTROLS, removals).items():
+            control_trials[name] = Trial("tde", decoding, control=control)
         control_outcomes = runner.run_trials(evaluated_run, estimator, control_trials.values())
-        for name, trial in control_trials.items():
-            yield from report.removal_rows(name, control_outcomes[trial])
+        hard_controls = {name: control_outcomes[trial] for name, trial in control_trials.items()}
 
-    # A counterfactual memory of its own is compared with the factual one.
-    if direct_policy == "own" and policies.spec.counterfactual_memory == "own":
-        factual_run = evaluated_run._replace(policies=policies.with_counterfactual_memory("factual"))
-        factual_outcomes = runner.run_trials(factual_run, estimator, [hard_trial])
-        yield from report.removal_rows("TDE, factual memory", factual_outcomes[hard_trial])
+        # A counterfactual memory of its own is compared with the factual one.
+        if policies.spec.counterfactual_memory == "own":
+            factual_run = evaluated_run._replace(policies=policies.with_counterfactual_memory("factual"))
+            factual_outcomes = runner.run_trials(factual_run, estimator, [hard_trial])
+            hard_controls["TDE, factual memory"] = factual_outcomes[hard_trial]
 
+    # Soft removal by each gap, with the controls of its form.
     permuted_run = evaluated_run._replace(policies=policies.with_permuted_evidence(bench.config.seed))
-
-    # Every rule is compared with its own controls and with the best removal that follows no gap. The latter is chosen
-    # on these very episodes, so the comparison favours the control.
-    best_fixed = {}
-    if outcome_by_fixed:
-        best_name = max(outcome_by_fixed, key=lambda name: report.mixture_gain(outcome_by_fixed[name], budgets[-1]))
-        best_fixed = {best_name: outcome_by_fixed[best_name]}
-    for rule in select_removals({str(rule): rule for rule in rules}, bench.config.removals).values():
+    rule_outcomes = {}
+    rule_controls = {}
+    for name, rule in select_removals({str(rule): rule for rule in rules}, removals).items():
         if not policies.supports_gap(rule.gap):
             bench.console.print(f"{rule}: left out, for the run has no evidence for this gap; train it again")
             continue
-        bench.console.print(str(rule))
+        bench.console.print(name)
         rule_estimator = dataclasses.replace(estimators_by_gap(estimator)[rule.gap], hold=rule.hold)
         trial = Trial("stde", decoding, *rule.options)
-        control_trials = {}
+        controls: dict[str, Trial] = {}
         for control in CONTROLS_BY_FORM[rule.options.form]:
-            control_trials[control] = dataclasses.replace(trial, control=control)
-        rule_outcomes = runner.run_trials(evaluated_run, rule_estimator, [trial, *control_trials.values()])
-        compared_outcomes = {control: rule_outcomes[control_trial] for control, control_trial in control_trials.items()}
+            controls[control] = dataclasses.replace(trial, control=control)
+        trial_outcomes = runner.run_trials(evaluated_run, rule_estimator, [trial, *controls.values()])
+        rule_outcomes[name] = trial_outcomes[trial]
+        rule_controls[name] = {control: trial_outcomes[control_trial] for control, control_trial in controls.items()}
         if rule.gap in EVIDENCE_GAPS:
-            compared_outcomes[PERMUTED_CONTROL] = runner.run_trials(permuted_run, rule_estimator, [trial])[trial]
-        yield from report.removal_rows(str(rule), rule_outcomes[trial], compared_outcomes | best_fixed)
+            permuted_outcomes = runner.run_trials(permuted_run, rule_estimator, [trial])
+            rule_controls[name][PERMUTED_CONTROL] = permuted_outcomes[trial]
+
+    return RemovalOutcomes(
+        layout_blind=layout_blind_outcome,
+        plain=outcomes[plain_trial],
+        hard=outcomes[hard_trial],
+        fixed={name: outcomes[trial] for name, trial in fixed_trials.items()},
+        hard_controls=hard_controls,
+        rules=rule_outcomes,
+        rule_controls=rule_controls,
+    )
 
 
 def list_removal_names() -> list[str]:
@@ -297,8 +358,8 @@ class MixedPopulation(NamedTuple):
     shift: np.ndarray
 
 
-def draw_mixed_population(bench: Bench, run: AgentRun, shifts: Sequence[float]) -> MixedPopulation:
-    """Draw episodes in the scenes of a run, equally many at every shift."""
+def draw_mixed_population(bench: Bench, run: AgentRun, shifts: Sequence[float], num_folds: int = 1) -> MixedPopulation:
+    """Draw episodes in the scenes of a run, equally many at every shift; folds share the experiment's episodes."""
     # All worlds are compiled before any episode is drawn; each has one bank.
     worlds = [bench.compile_world(run, shift) for shift in shifts]
 
@@ -307,7 +368,7 @@ def draw_mixed_population(bench: Bench, run: AgentRun, shifts: Sequence[float]) 
     num_episodes = []
     num_poses = []
     for world in worlds:
-        episodes = bench.draw_episodes(world)
+        episodes = bench.draw_episodes(world, num_folds)
         episode_lists.append(episodes)
         num_episodes.append(len(episodes.pose))
         num_poses.append(len(world.banks[0].rows))

@@ -19,7 +19,7 @@ import jinja2.nodes
 from jaxnav.errors import InputError
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.experiments.bench import best_epsilon
-from jaxnav.experiments.config import AgentRun, ExperimentConfig, agent_runs
+from jaxnav.experiments.config import AgentRun, ExperimentConfig, agent_runs, join_folds
 from jaxnav.experiments.scores import chooses_actions
 from jaxnav.experiments.table import ResultTable, merge_fields
 from jaxnav.scenes.worlds import WORLDS
@@ -164,8 +164,9 @@ def _runs_with_results(config: ExperimentConfig, table: ResultTable) -> dict[str
     """Runs that have results, by world and agent."""
     # The name of a run that hands over to another begins with the name of its agent.
     measured = {(row.world, row.run.partition(",")[0]) for row in table.rows}
-    runs: dict[str, dict[str, AgentRun]] = {world: {} for world in config.worlds}
-    for run in agent_runs(config):
+    all_runs = agent_runs(config)
+    runs: dict[str, dict[str, AgentRun]] = {world: {} for world in (*config.folds, *config.worlds)}
+    for run in all_runs + join_folds(config, all_runs):
         if (run.world, run.agent) in measured:
             runs[run.world][run.agent] = run
     return {world: world_runs for world, world_runs in runs.items() if world_runs}

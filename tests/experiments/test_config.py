@@ -198,6 +198,12 @@ def test_finished_runs_of_agents_keep_their_settings_and_references(drawn_run):
             {"groups": {"all": {"agents": ["plain"], "variant": "stde", "against": "plane/layout"}}},
             "groups.all.against",
         ),
+        # Folds are worlds, each of one dataset.
+        ({"folds": {"all": "near"}}, "folds.all: 'near'"),
+        ({"folds": {"all": []}}, r"folds.all: \[\]"),
+        ({"folds": {"all": ["nowhere"]}}, "folds.all: 'nowhere'"),
+        ({"folds": {"near": ["near"]}}, "folds.near: a world"),
+        ({"folds": {"all": ["near"], "both": ["near"]}}, "listed twice"),
         # Finished runs.
         ({"run": Path("nowhere")}, "nowhere"),
         ({"reference": "nowhere"}, "reference.*nowhere"),

@@ -11,6 +11,7 @@ from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.grid import EpisodeOutcome
 from jaxnav.evaluation.statistics import Interval
+from jaxnav.experiments.config import join_folds
 from jaxnav.experiments.mixture import (
     HARD_CONTROLS,
     LAYOUT_BLIND,
@@ -237,6 +238,38 @@ def test_handover_leaves_the_layout_blind_agents(bench):
             change = table.find(row_fields, variant="TDE", reference=WITHOUT_REMOVAL, shift=shift, metric=metric)
             layout_blind = table.find(row_fields, variant=LAYOUT_BLIND, shift=shift, metric=metric)
             assert agent.mean + change.mean == pytest.approx(layout_blind.mean)
+
+
+@pytest.mark.slow
+def test_folds_of_a_dataset_count_as_one_world(make_bench, drawn_run):
+    # Two folds share 16 episodes, so every mean over the dataset is that of the folds with eight episodes each.
+    run = {"run": str(drawn_run.config.run_dir)}
+    folds = {"first": {"worlds": {"seed": 1}}, "second": {"worlds": {"seed": 2}}}
+    settings = {"worlds": folds, "agents": {"main": run, "anonymous": run}, "shifts": (0.0, 1.0), "removals": ()}
+    fold_tables = []
+    for fold in folds:
+        fold_bench = make_bench(**settings, episodes=8)
+        fold_tables.append(ResultTable(measure_handover(fold_bench, fold_bench.find_run(fold, "main"), "argmax", ())))
+
+    dataset_bench = make_bench(**settings, episodes=16, folds={"both": list(folds)})
+    (dataset_run,) = join_folds(dataset_bench.config, [dataset_bench.find_run("first", "main")])
+    assert [fold.world for fold in dataset_run.folds] == list(folds)
+    table = ResultTable(measure_handover(dataset_bench, dataset_run, "argmax", ()))
+    assert table.num_scenes(variant=WITHOUT_REMOVAL) == 2 * fold_tables[0].num_scenes(variant=WITHOUT_REMOVAL)
+    num_compared = 0
+    for row in table.rows:
+        if row.metric in METRICS and row.variant != ORACLE_NAME:
+            fields = {
+                name: getattr(row, name) for name in ("run", "variant", "decoding", "shift", "reference", "metric")
+            }
+            fold_means = []
+            for fold, fold_table in zip(folds, fold_tables, strict=True):
+                fold_means.append(fold_table.find(fields, world=fold).mean)
+            assert row.world == "both"
+            assert row.value.mean == pytest.approx(sum(fold_means) / 2)
+            num_compared += 1
+    # Two agents, their lead and the change by removal at two shifts, and the change over the mixture.
+    assert num_compared == len(METRICS) * (4 * 2 + 1)
 
 
 @pytest.mark.exhaustive
