@@ -188,7 +188,7 @@ def _measure_removals(
         fold_outcomes.append(_run_removals(bench, fold_run, population, decoding, rules, remaining))
     episodes = join_episode_lists([population.episodes for population in populations])
     shift_index = np.concatenate([population.shift for population in populations])
-    outcomes: RemovalOutcomes = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *fold_outcomes)
+    outcomes = RemovalOutcomes(*map(_join_outcomes, zip(*fold_outcomes, strict=True)))
 
     # Values of the agents themselves.
     metrics = PopulationMetrics(episodes, shift_index, budgets)
@@ -225,6 +225,13 @@ def _measure_removals(
         best_fixed = {best_name: outcomes.fixed[best_name]}
     for name, outcome in outcomes.rules.items():
         yield from report.removal_rows(name, outcome, outcomes.rule_controls[name] | best_fixed)
+
+
+def _join_outcomes(parts: Sequence[Any]) -> Any:
+    """Join the outcomes of folds along their episodes; dictionaries of outcomes keep their order."""
+    if isinstance(parts[0], dict):
+        return {name: _join_outcomes([part[name] for part in parts]) for name in parts[0]}
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *parts)
 
 
 def _run_removals(
