@@ -742,8 +742,19 @@ def _format_int_pairs(values: dict[str, int]) -> list[str]:
 
 
 def _prepare_jax(console: Console) -> None:
-    """Set the modes of JAX that a command needs, and warn about one that makes it very slow."""
-    import jax
+    """Set the modes of JAX that a command needs, and warn about one that makes it very slow.
+
+    Raises:
+      InputError: an environment variable of JAX has an impossible value.
+    """
+    try:
+        import jax
+    except ValueError as error:
+        # JAX names the variable, or its setting in lower case.
+        for name, value in os.environ.items():
+            if name.startswith("JAX_") and name.lower() in str(error).lower():
+                raise InputError(f"{name}={value}: is no value that JAX takes; unset it") from error
+        raise
 
     jax.config.update("jax_enable_x64", False)  # policies compute in float32
     if jax.config.values["jax_disable_jit"]:

@@ -97,6 +97,17 @@ def test_a_missing_backend_is_one_line(error, monkeypatch, capsys):
     assert_message_names(capsys.readouterr().err, "error: JAX_PLATFORMS=x: ", "no such device", "unset it")
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("JAX_ENABLE_X64", "maybe"), ("JAX_DEFAULT_MATMUL_PRECISION", "exact"), ("JAX_NUM_CPU_DEVICES", "many")],
+)
+def test_impossible_settings_of_jax_are_one_line(name, value):
+    # JAX reads its variables when it is imported, so each needs a process of its own.
+    returncode, output = run_jaxnav("eval", "rooms-org", **{name: value})
+    assert returncode == 2
+    assert_message_names(output, f"error: {name}={value}: ", "unset it")
+
+
 def test_a_bug_is_not_taken_for_a_missing_backend():
     def fail(_):
         raise AssertionError("a bug")
