@@ -25,9 +25,11 @@ from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.statistics import (
     Clusters,
     Interval,
+    interquartile_mean,
     jackknife_interval,
     mean_interval,
     paired_difference,
+    probability_of_improvement,
     run_clusters,
     scene_clusters,
 )
@@ -91,6 +93,13 @@ def build_row(
                 interval = mean_interval(metric_values[:, in_bucket], clusters, trained=is_trained)
                 buckets[bucket_name][metric_name] = interval.to_json()
 
+    # The interquartile mean of all episodes, which a few very good or bad homes do not decide.
+    is_trained = trained and variant not in UNTRAINED_VARIANTS
+    interquartile_means = {}
+    for metric_name in ("sr", "spl"):
+        interval = interquartile_mean(scaled_metrics[metric_name], episodes.clusters(), trained=is_trained)
+        interquartile_means[metric_name] = interval.to_json()
+
     # The overall metrics stand in the row itself, next to all buckets.
     return {
         "variant": variant,
@@ -102,6 +111,7 @@ def build_row(
         "form": form,
         "seeds": len(metrics["sr"]),
         **buckets["L>=1"],
+        "interquartile_mean": interquartile_means,
         "buckets": buckets,
     }
 
@@ -138,12 +148,15 @@ def build_difference(
     compared_name, compared_results = compared
 
     # The difference is taken episode by episode, over all lengths L*.
-    paired = paired_difference(
-        _to_report_units(metric, reference_results),
-        _to_report_units(metric, compared_results),
-        episodes.clusters(),
-        same_runs=same_runs,
-        trained=trained,
+    reference_values = _to_report_units(metric, reference_results)
+    compared_values = _to_report_units(metric, compared_results)
+    clusters = episodes.clusters()
+    paired = paired_difference(reference_values, compared_values, clusters, same_runs=same_runs, trained=trained)
+
+    # A distance is better if it is shorter.
+    sign = -1.0 if metric == "dts" else 1.0
+    improvement = probability_of_improvement(
+        sign * reference_values, sign * compared_values, clusters, same_runs=same_runs, trained=trained
     )
     return {
         "metric": metric,
@@ -153,6 +166,7 @@ def build_difference(
         "form": form,
         "decoding": decoding,
         **paired.to_json(),
+        "probability_of_improvement": improvement.to_json(),
     }
 
 
@@ -256,20 +270,25 @@ def results_table(report: dict[str, Any]) -> Table:
 def difference_table(report: dict[str, Any]) -> Table:
     """Make the table of the paired differences for a terminal.
 
-    One line per comparison and decoding, `mean [95 % interval]`.
+    One line per comparison and decoding, `mean [95 % interval]`, and the probability of improvement in SR.
     """
     # A report lists one difference per metric; its metrics stand side by side in the table.
     cells_by_comparison: dict[tuple[str, str], list[str]] = {}
+    improvement_by_comparison: dict[tuple[str, str], str] = {}
     for difference in report["differences"]:
         _, digits = METRIC_COLUMNS[difference["metric"]]
         cell = f"{Interval.from_json(difference):+.{digits}f}"
         comparison = (difference_label(difference), difference["decoding"])
         cells_by_comparison.setdefault(comparison, []).append(cell)
+        # Reports of versions before 0.4 lack the probability.
+        if difference["metric"] == "sr" and "probability_of_improvement" in difference:
+            improvement = Interval.from_json(difference["probability_of_improvement"])
+            improvement_by_comparison[comparison] = f"{improvement:.2f}"
 
     # The report lists the differences of a comparison in the order of these columns.
-    table = Table("Difference, paired on episodes", "decoding", *_metric_titles())
+    table = Table("Difference, paired on episodes", "decoding", *_metric_titles(), "P(better SR)")
     for comparison, cells in cells_by_comparison.items():
-        table.add_row(*comparison, *cells)
+        table.add_row(*comparison, *cells, improvement_by_comparison.get(comparison, ""))
     return table
 
 

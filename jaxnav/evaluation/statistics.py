@@ -172,6 +172,95 @@ def paired_difference(
     return jackknife_interval(replicates, scenes, runs, std=combined_std)
 
 
+def interquartile_mean(values: np.ndarray, scenes: Clusters, *, trained: bool = True) -> Interval:
+    """Compute the interquartile mean of results with its interval.
+
+    Each training run has a mean in each floor plan. The interquartile mean is the mean of the middle half of these, so
+    that a few very good or very bad runs and homes do not decide (Agarwal et al., 2021, with floor plans as tasks).
+
+    Args:
+      values: bool, int or float [S, E], finite, by training run and episode.
+      scenes: clusters of the E episodes.
+      trained: True if rows are training runs; False if they are repetitions, which count as one.
+
+    Raises:
+      InputError: see `mean_interval`.
+    """
+    values = _as_finite_results("values", values, scenes)
+    plan_means = _means_by_cluster(values if trained else values.mean(axis=0, keepdims=True), scenes)
+    num_runs, num_plans = plan_means.shape
+    scene_weights = _cluster_weights(scenes)  # [C, 1 + C]
+
+    def trimmed_mean(run_weights: np.ndarray, plan_weights: np.ndarray) -> float:
+        weights = np.outer(run_weights, plan_weights).ravel()
+        if not weights.any():
+            return math.nan  # nothing is left of a single run or floor plan
+
+        # Of the sorted weights, those between the first and the last quarter of the total count.
+        order = np.argsort(plan_means, axis=None)
+        weights_below = np.cumsum(weights[order]) / weights.sum()
+        inner_weights = np.diff(np.clip(weights_below, 0.25, 0.75), prepend=0.25)
+        return float(plan_means.ravel()[order] @ inner_weights / inner_weights.sum())
+
+    # Leave out one run, one floor plan, or both.
+    runs = run_clusters(1, num_runs)
+    replicates = np.empty((runs.weights.shape[1], 1 + num_plans))
+    for run_column in range(replicates.shape[0]):
+        for plan_column in range(1 + num_plans):
+            replicates[run_column, plan_column] = trimmed_mean(
+                runs.weights[:, run_column], scene_weights[:, plan_column]
+            )
+    return jackknife_interval(replicates if trained else replicates[0], scenes, runs if trained else None)
+
+
+def probability_of_improvement(
+    reference: np.ndarray, compared: np.ndarray, scenes: Clusters, *, same_runs: bool = False, trained: bool = True
+) -> Interval:
+    """Compute the probability that a run of `compared` is better than a run of `reference` on a random floor plan.
+
+    Runs are compared by their mean results on the floor plan, and ties count half (Agarwal et al., 2021). A value of
+    0.5 means that neither is better. Large differences on a few floor plans count no more than small ones.
+
+    Args:
+      reference: bool, int or float [S, E], finite.
+      compared: the same shape.
+      scenes: clusters of the E episodes.
+      same_runs: True if row s of both sides is the same network, which is then compared with itself alone.
+      trained: True to generalize to other training runs; False for the interval of these policies in other scenes.
+
+    Raises:
+      InputError: see `paired_difference`.
+    """
+    reference = _as_finite_results("reference", reference, scenes)
+    compared = _as_finite_results("compared", compared, scenes)
+    if reference.shape != compared.shape:
+        raise InputError(
+            f"reference has shape {reference.shape} and compared has shape {compared.shape}; evaluate both on equal "
+            "runs and episodes"
+        )
+    reference_means = _means_by_cluster(reference, scenes)
+    compared_means = _means_by_cluster(compared, scenes)
+    num_runs, num_plans = reference_means.shape
+
+    # Which run of either side is better on each floor plan, [S, S, C].
+    difference = compared_means[None, :] - reference_means[:, None]
+    is_better = (difference > 0) + 0.5 * (difference == 0)
+    scene_weights = _cluster_weights(scenes)
+    if same_runs:
+        own_pairs = is_better[np.arange(num_runs), np.arange(num_runs)]  # [S, C]
+        runs = run_clusters(1, num_runs)
+        replicates = runs.weights.T @ own_pairs @ scene_weights / (num_runs * num_plans)
+    else:
+        runs = run_clusters(2, num_runs)
+        reference_weights = runs.weights[:num_runs]
+        compared_weights = runs.weights[num_runs:]
+        weighted_sums = np.einsum(
+            "rj,sj,rsc,ck->jk", reference_weights, compared_weights, is_better, scene_weights, optimize=True
+        )
+        replicates = weighted_sums / (num_runs**2 * num_plans)
+    return jackknife_interval(replicates if trained else replicates[0], scenes, runs if trained else None)
+
+
 def jackknife_interval(
     replicates: np.ndarray,
     scenes: Clusters,
@@ -271,6 +360,21 @@ def leave_one_out(labels: np.ndarray, strata: np.ndarray | None = None, counts: 
         scale=(stratum_size - 1) / stratum_size,
         degrees_of_freedom=len(clusters) - len(np.unique(stratum_of_cluster)),
     )
+
+
+def _means_by_cluster(values: np.ndarray, scenes: Clusters) -> np.ndarray:
+    """Average results [S, E] over the episodes of each cluster, float64 [S, C]."""
+    # A column leaves out exactly the items of its cluster.
+    in_cluster = (scenes.weights[:, 1:] == 0.0).astype(np.float64)
+    return values @ in_cluster / in_cluster.sum(axis=0)
+
+
+def _cluster_weights(scenes: Clusters) -> np.ndarray:
+    """Leave-one-out weights of clusters that count alike, float64 [C, 1 + C]; see `Clusters`."""
+    first_items = np.argmax(scenes.weights[:, 1:] == 0.0, axis=0)
+    weights = scenes.weights[first_items]
+    total_weights = weights.sum(axis=0)
+    return weights * len(weights) / np.where(total_weights > 0.0, total_weights, 1.0)
 
 
 def _mean_over_runs(values: np.ndarray, scenes: Clusters) -> Interval:

@@ -58,8 +58,8 @@ SHIFT_CAPTIONS = {0.0: "layout as trained", 1.0: "layout shifted"}
 VARIANT_CAPTIONS = {
     "baseline": "no layout weights",
     "layout": "experience kept",
-    "stde": "experience removed (sTDE)",
-    "scde": "experience removed (sCDE)",
+    "stde": "removed by sTDE",
+    "scde": "removed by sCDE",
 }
 
 # Size of a panel, inches.

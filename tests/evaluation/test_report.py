@@ -47,7 +47,7 @@ def bounds_around(mean, variance, degrees):
 def test_row_has_all_keys_of_the_format():
     metrics = ["sr", "spl", "dts", "sae", "timeout", "wrong_done"]
     row = make_row()
-    assert set(row) == {*IDENTITY, *SETTING, "seeds", "episodes", *metrics, "buckets"}
+    assert set(row) == {*IDENTITY, *SETTING, "seeds", "episodes", *metrics, "interquartile_mean", "buckets"}
     assert set(row["buckets"]) == {"L>=1", "L>=5"}
     assert set(row["buckets"]["L>=5"]) == {"episodes", *metrics}
     assert set(row["sr"]) == {"mean", "std", "ci95", "seeds"}
@@ -129,6 +129,8 @@ def test_difference_is_in_points():
         episodes=EPISODES,
         same_runs=True,
     )
+    # Ties count half: run 0 has four, run 1 is better in two of four scenes.
+    assert difference.pop("probability_of_improvement")["mean"] == pytest.approx((4 * 0.5 + 2 * 0.5 + 2) / 8)
     assert difference == {
         "metric": "sr",
         "from": "layout",
@@ -142,6 +144,27 @@ def test_difference_is_in_points():
         "ci95": bounds_around(25, 625, 1),
         "seeds": [0, 50],
     }
+
+
+def test_shorter_distances_are_improvements():
+    shorter = np.array([[0.0, 0.4, 1.0, 0.5], [0.0, 1.0, 1.0, 0.4]])
+    difference = reports.build_difference(
+        "dts",
+        ("layout", make_metrics()["dts"]),
+        ("stde", shorter),
+        epsilon=0.5,
+        form="residual",
+        decoding="argmax",
+        episodes=EPISODES,
+        same_runs=True,
+    )
+    # Run 0: tie, shorter, shorter, tie; run 1: tie and three times shorter.
+    assert difference["probability_of_improvement"]["mean"] == pytest.approx((3 * 0.5 + 5) / 8)
+
+
+def test_row_has_the_interquartile_mean_of_all_episodes():
+    # Success of two runs in four scenes: 0 three times and 100 five times; the middle four are 0, 100, 100 and 100.
+    assert make_row()["interquartile_mean"]["sr"]["mean"] == pytest.approx(75.0)
 
 
 def test_written_report_is_read_back(tmp_path):

@@ -91,7 +91,11 @@ def test_difference_table_has_a_line_per_comparison():
     label, *cells = (str(next(iter(column.cells))) for column in table.columns)
     assert table.row_count == 1
     assert "sTDE" in label
-    assert cells == ["argmax", "+25.0 [+10.0, +40.0]", "-1.2 [-2.0, +0.5]", "-0.03 [-0.10, +0.00]"]
+    # Reports of earlier versions lack the probability of improvement.
+    assert cells == ["argmax", "+25.0 [+10.0, +40.0]", "-1.2 [-2.0, +0.5]", "-0.03 [-0.10, +0.00]", ""]
+    report["differences"][0]["probability_of_improvement"] = {"mean": 0.625, "ci95": [0.5, 0.75]}
+    *_, column = report_tables.difference_table(report).columns
+    assert list(column.cells) == ["0.62 [0.50, 0.75]"]
 
 
 def make_share(part, share, partner_difference, cost):

@@ -6,16 +6,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import t
+from scipy.stats import t, trim_mean
 from support.simulated_results import SIZES, coverage, episode_bootstrap, jackknifed
 
 from jaxnav.errors import InputError
 from jaxnav.evaluation.statistics import (
     Interval,
+    interquartile_mean,
     jackknife_interval,
     leave_one_out,
     mean_interval,
     paired_difference,
+    probability_of_improvement,
     run_clusters,
     scene_clusters,
 )
@@ -235,3 +237,68 @@ def test_run_clusters_leave_runs_out_within_their_arm():
     runs = run_clusters(2, 3)
     assert runs.degrees_of_freedom == 4
     np.testing.assert_allclose(runs.weights[:, 1], [0, 1.5, 1.5, 1, 1, 1])
+
+
+# Statistics of runs and floor plans
+
+
+def test_interquartile_mean_is_that_of_the_middle_half():
+    # Of 0, 1, ..., 7 the middle half is 2, 3, 4 and 5, however far the greatest value is from the rest.
+    for greatest in (7.0, 1000.0):
+        values = np.array([[0.0, 1, 2, 3, 4, 5, 6, greatest]])
+        assert interquartile_mean(values, scenes_of(8), trained=False).mean == pytest.approx(3.5)
+    # Of five values, the quartiles cut the second and the fourth: (0.75 * 2 + 3 + 0.75 * 9) / 2.5 = 4.5.
+    assert interquartile_mean(np.array([[9.0, 1, 2, 3, 50]]), scenes_of(5), trained=False).mean == pytest.approx(4.5)
+
+
+def test_interquartile_mean_takes_runs_and_floor_plans_together():
+    # Each plan has two episodes. Plan means of the runs: 0, 1, 2, 3 and 4, 5, 6, 7; the middle half is 2 to 5.
+    plan_means = np.array([[0.0, 1, 2, 3], [4, 5, 6, 7]])
+    values = np.repeat(plan_means, 2, axis=1) + np.array([[-0.25, 0.25] * 4] * 2)
+    interval = interquartile_mean(values, scenes_of(4, 2))
+    assert interval.mean == pytest.approx(3.5)
+    assert interval.low < 3.5 < interval.high
+
+
+@given(st.lists(st.integers(-50, 50), min_size=8, max_size=8))
+def test_interquartile_mean_is_scipys_trimmed_mean(numbers):
+    interval = interquartile_mean(np.array([numbers], float), scenes_of(8), trained=False)
+    assert interval.mean == pytest.approx(trim_mean(numbers, 0.25))
+
+
+def test_probability_of_improvement_counts_pairs_of_runs():
+    # Of the four pairs of runs, 2 > 1, 4 > 1 and 4 > 3; 2 < 3.
+    reference = np.repeat([[1.0], [3]], 4, axis=1)
+    compared = np.repeat([[2.0], [4]], 4, axis=1)
+    assert probability_of_improvement(reference, compared, scenes_of(4)).mean == pytest.approx(3 / 4)
+    # The same networks are compared with themselves alone: 2 > 1 and 4 > 3.
+    assert probability_of_improvement(reference, compared, scenes_of(4), same_runs=True).mean == pytest.approx(1.0)
+
+
+def test_probability_of_improvement_counts_plans_alike_and_ties_half():
+    # Better on one plan by a lot, worse on two by little, equal on the last: (1 + 0 + 0 + 0.5) / 4.
+    reference = np.array([[0.0, 1, 1, 1]])
+    compared = np.array([[100.0, 0.9, 0.9, 1]])
+    interval = probability_of_improvement(reference, compared, scenes_of(4), trained=False)
+    assert interval.mean == pytest.approx(1.5 / 4)
+    # Values 1, 0, 0 and 0.5 of four plans: the variance of their mean is 0.2292 / 4, with 3 degrees of freedom.
+    assert half_width(interval) == pytest.approx(t.ppf(0.975, 3) * math.sqrt(np.var([1, 0, 0, 0.5], ddof=1) / 4))
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_improvements_of_both_sides_add_up_to_one(seed):
+    rng = np.random.default_rng(seed)
+    first, second = rng.integers(0, 3, (2, 3, 12)).astype(float)
+    scenes = leave_one_out(np.repeat(np.arange(4), 3))
+    forth = probability_of_improvement(first, second, scenes)
+    back = probability_of_improvement(second, first, scenes)
+    assert forth.mean + back.mean == pytest.approx(1.0)
+    assert forth.low == pytest.approx(1.0 - back.high)
+
+
+def test_new_statistics_of_one_scene_or_run_have_no_bounds():
+    values = np.ones((1, 6))
+    for scenes in (scenes_of(1, 6), scenes_of(6)):
+        assert not interquartile_mean(values, scenes).has_bounds
+        assert not probability_of_improvement(values, values, scenes).has_bounds
+        assert probability_of_improvement(values, values, scenes).mean == pytest.approx(0.5)
