@@ -53,6 +53,7 @@ if TYPE_CHECKING:
         Task,
     )
     from jaxnav.scenes.worlds import make_generated_scenes, shift_scenes
+    from jaxnav.viz.animate import animate
 
 try:
     __version__ = importlib.metadata.version("jaxnav")
@@ -107,6 +108,7 @@ __all__ = [
     "Task",
     "Tracker",
     "__version__",
+    "animate",
     "build_environment",
     "causal",
     "cell_centres",
@@ -168,6 +170,7 @@ _NAMES_BY_MODULE = {
         "Task",
     ),
     "scenes.worlds": ("make_generated_scenes", "shift_scenes"),
+    "viz.animate": ("animate",),
 }
 
 # Imports of 0.2 get an error with the new name.

@@ -2,9 +2,10 @@
 
 `play_episode` plays an episode of a run or of an exported policy and returns one `PlayedEpisode` for each variant and
 layout shift. `draw_episode` writes their picture, a GIF or a PNG with an `EpisodePanel` for each: the scene from above,
-the detections and the layout gap.
+the detections and the layout gap. `draw_frames` and `encode_gif` are its two steps.
 """
 
+import io
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -40,7 +41,7 @@ from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.tables.observation_row import RowFormat, detected_positions
 from jaxnav.scenes.tables.visibility import cell_centres
 from jaxnav.scenes.task import DONE, Task
-from jaxnav.store.files import expand_home
+from jaxnav.store.files import expand_home, write_atomic
 from jaxnav.viz.scene import (
     draw_agent,
     draw_plan,
@@ -71,6 +72,7 @@ MAX_FRAMES = 60
 STEP_MILLISECONDS = 220
 LAST_MILLISECONDS = 2500
 NUM_COLORS = 128
+_NUM_PALETTE_FRAMES = 8
 
 _MAX_DETECTIONS = 8  # bars in a panel
 
@@ -328,17 +330,38 @@ def _make_played_episode(
 # The picture
 
 
-@default_style
 def draw_episode(episodes: Sequence[PlayedEpisode], path: Path) -> None:
-    """Write the picture of an episode: a row of panels for each variant, a column for each layout shift.
-
-    All panels show one step at a time; a panel whose episode has ended keeps its last step. Hollow stars mark the goals
-    of the first panel in all others. A path that ends in .gif gets a frame per step, or evenly spaced frames of
-    an episode with more than 60 steps; another path gets the last frame.
+    """Write the picture of an episode: a GIF, or a PNG of its end; see `draw_frames`.
 
     Args:
       episodes: one or more episodes with equal room, goal and start, as `play_episode` returns them.
-      path: file to write.
+      path: file to write; a name that ends in .gif becomes a GIF.
+    """
+    if path.suffix == ".gif":
+        picture = encode_gif(draw_frames(episodes), STEP_MILLISECONDS)
+    else:
+        png = io.BytesIO()
+        draw_frames(episodes, last_only=True)[-1].save(png, format="PNG", optimize=True)
+        picture = png.getvalue()
+
+    # An interruption leaves no half-written picture.
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, picture)
+
+
+@default_style
+def draw_frames(episodes: Sequence[PlayedEpisode], *, last_only: bool = False) -> list[Image.Image]:
+    """Draw an episode: a row of panels for each variant, a column for each layout shift.
+
+    All panels show one step at a time; a panel whose episode has ended keeps its last step. Hollow stars mark the goals
+    of the first panel in all others.
+
+    Args:
+      episodes: one or more episodes with equal room, goal and start, as `play_episode` returns them.
+      last_only: True for the last frame alone.
+
+    Returns:
+      A frame for each step, or evenly spaced frames of an episode with more than 60 steps.
     """
     first_episode = episodes[0]
     num_rows = len({episode.variant for episode in episodes})
@@ -363,40 +386,40 @@ def draw_episode(episodes: Sequence[PlayedEpisode], path: Path) -> None:
 
     # One frame for each step, or the last one alone.
     last_step = max_steps - 1
-    is_gif = path.suffix == ".gif"
     step_stride = -(-max_steps // MAX_FRAMES)
-    frame_steps = [*range(0, last_step, step_stride), last_step] if is_gif else [last_step]
+    frame_steps = [last_step] if last_only else [*range(0, last_step, step_stride), last_step]
     frames = []
     for step in frame_steps:
         for panel in panels:
             panel.draw_step(step)
         canvas.draw()
         frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
-
-    # Only a GIF has more than one frame.
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if is_gif:
-        _write_gif(frames, path)
-    else:
-        frames[-1].save(path, format="PNG", optimize=True)
+    return frames
 
 
-def _write_gif(frames: list[Image.Image], path: Path) -> None:
-    """Write frames with one palette.
+def encode_gif(frames: Sequence[Image.Image], step_milliseconds: int) -> bytes:
+    """Encode frames with one palette as a GIF, whose last frame stays longer.
 
     Equal pixels stay equal from frame to frame, which keeps the file small.
     """
-    # The palette of the frame with most colors serves all frames.
-    richest_frame = max(frames, key=lambda frame: len(frame.getcolors(2**20) or ()))
-    palette = richest_frame.quantize(NUM_COLORS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    # The palette of some frames, evenly spaced, serves all frames.
+    palette_stride = -(-len(frames) // _NUM_PALETTE_FRAMES)
+    sampled_pixels = np.concatenate([np.asarray(frame) for frame in frames[::palette_stride]])
+    palette = Image.fromarray(sampled_pixels).quantize(
+        NUM_COLORS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE
+    )
     palette_frames = []
     for frame in frames:
         palette_frames.append(frame.quantize(palette=palette, dither=Image.Dither.NONE))
 
     # The end stays longer, before the GIF starts again.
-    frame_durations = [STEP_MILLISECONDS] * (len(frames) - 1) + [LAST_MILLISECONDS]
+    frame_durations = [step_milliseconds] * (len(frames) - 1) + [LAST_MILLISECONDS]
     first_frame, *next_frames = palette_frames
-    first_frame.save(path, save_all=True, append_images=next_frames, duration=frame_durations, loop=0, optimize=True)
+    gif = io.BytesIO()
+    first_frame.save(
+        gif, format="GIF", save_all=True, append_images=next_frames, duration=frame_durations, loop=0, optimize=True
+    )
+    return gif.getvalue()
 
 
 class EpisodePanel:
