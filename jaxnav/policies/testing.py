@@ -122,7 +122,12 @@ def _uniform_knowledge(method: Method, env: ObjectNav, bank: Bank) -> Knowledge:
 def _with_random_actor(params: dict[str, Any], key: jax.Array) -> dict[str, Any]:
     """Replace the actor's kernel, which is nearly zero at first, by a random one; other policies change all over."""
     if "actor" not in params:
-        return jax.tree.map(lambda leaf: leaf + 0.1 * jax.random.normal(key, leaf.shape), params)
+        # Every leaf has a key of its own, or leaves of one shape would change alike.
+        leaves, structure = jax.tree.flatten(params)
+        leaf_keys = jax.tree.unflatten(structure, list(jax.random.split(key, len(leaves))))
+        return jax.tree.map(
+            lambda leaf, leaf_key: leaf + 0.1 * jax.random.normal(leaf_key, leaf.shape), params, leaf_keys
+        )
     kernel = jax.random.normal(key, params["actor"]["kernel"].shape)
     return params | {"actor": params["actor"] | {"kernel": kernel}}
 
