@@ -70,6 +70,10 @@ class EvalConfig:
         `categories`: the categories other than the goal within experience, on a quarter of the episodes. `all`: every
         part, on all episodes. The shares of decisions that change are always measured.
       seed: random seed of the episode list and of sampled actions, from 0 to 4,294,967,295.
+      benchmark: name of a frozen benchmark (`v1`), which fixes homes, shifts, episodes and seeds; scores the subject on
+        its tracks (docs/leaderboard.md).
+      tracks: tracks of the benchmark, such as `rooms`. The default is all tracks with the categories of a policy, and
+        all tracks for an agent.
       json: JSON file to write. The default is a name after the options, such as `eval-val-shift1-seed3.json`, in the
         run directory, where `latest-eval.txt` names the newest evaluation; for policies and agents, in the working
         directory, with the name of the subject.
@@ -92,6 +96,8 @@ class EvalConfig:
     counterfactual_memory: CounterfactualMemory | None = None
     costs: Costs = "categories"
     seed: int = 0
+    benchmark: str | None = None
+    tracks: tuple[str, ...] = ()
     json: Path | None = None
     format: Literal["table", "markdown", "json"] = "table"
 
@@ -107,6 +113,11 @@ def _evaluate_or_print(config: EvalConfig, console: Console) -> None:
     if path.is_file() or path.suffix == ".json":
         _print_report(_read_finished_report(config), config.format)
         return
+    if config.benchmark is not None:
+        _run_benchmark(config, console)
+        return
+    if config.tracks:
+        raise InputError(f"--tracks {' '.join(config.tracks)}: names parts of a benchmark; add --benchmark")
     from jaxnav.runs.evaluate import evaluate
 
     # Find the file first: an evaluation takes minutes.
@@ -141,6 +152,42 @@ def _evaluate_or_print(config: EvalConfig, console: Console) -> None:
     compilation_text = f", {num_compilations} compilation{plural}" if num_compilations else ""
     num_episodes = len(results.episodes.goal)
     console.print(f"{num_episodes} episodes{compilation_text}; written to {target}")
+
+
+#: Options that a benchmark fixes.
+_FIXED_BY_BENCHMARK = ("split", "scenes", "world", "shift", "shift_by", "episodes", "seed", "format")
+#: Options that say how a policy removes experience.
+_POLICY_OPTIONS = (
+    *("epsilon", "form", "setting", "hold", "inner_steps", "removal"),
+    *("counterfactual_memory", "costs"),
+)
+
+
+def _run_benchmark(config: EvalConfig, console: Console) -> None:
+    """Score the subject on a benchmark, print the scores and write them."""
+    from jaxnav.runs.benchmark import load_benchmark, run_benchmark, scores_table
+
+    # An evaluation takes minutes, so options and files are checked first.
+    load_benchmark(str(config.benchmark))
+    for name in _FIXED_BY_BENCHMARK:
+        if getattr(config, name) != getattr(EvalConfig, name):
+            raise InputError(
+                f"--{name.replace('_', '-')}: is fixed by --benchmark {config.benchmark}; omit one of them"
+            )
+    policy_options = {}
+    for name in _POLICY_OPTIONS:
+        if getattr(config, name) != getattr(EvalConfig, name):
+            policy_options[name] = getattr(config, name)
+    target = config.json or Path(f"benchmark-{config.benchmark}-{name_subject(config.subject)}.json")
+    refuse_folder(target, "--json")
+
+    scores = run_benchmark(
+        config.subject, str(config.benchmark), config.tracks or None, console=console, **policy_options
+    )
+    print_table(make_result_console(), scores_table(scores.rows), num_key_columns=2)
+    with refuse_unwritable(target, "--json"):
+        scores.write(target)
+    console.print(f"written to {target}")
 
 
 def _read_finished_report(config: EvalConfig) -> dict[str, Any]:

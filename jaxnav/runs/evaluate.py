@@ -164,6 +164,7 @@ def evaluate(
             shift_by=shift_by,
             num_episodes=episodes,
             seed=seed,
+            compiled=compiled,
             console=console,
         )
 

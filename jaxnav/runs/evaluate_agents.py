@@ -38,12 +38,13 @@ def evaluate_agents(
     shift_by: ShiftKind,
     num_episodes: int,
     seed: int,
+    compiled: CompiledWorld | None,
     console: Console,
 ) -> Results:
     """Evaluate agents on the fixed episodes of a world; see `jaxnav.evaluate`."""
     # A world gives the task; a scene file replaces its scenes.
     config = RunConfig(world=typing.cast(Any, world or DEFAULT_WORLD), scenes=scenes)  # checked when it is compiled
-    compiled = compile_evaluation_world(config, split, None, shift, console, shift_by=shift_by)
+    compiled = compiled or compile_evaluation_world(config, split, None, shift, console, shift_by=shift_by)
     episode_lists = draw_episode_lists(compiled, num_episodes, seed)
     key = jax.random.key(seed)
 

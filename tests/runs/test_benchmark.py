@@ -1,0 +1,156 @@
+"""Frozen benchmarks: what the manifest fixes, what is refused, and scores that follow from the stored episodes."""
+
+import csv
+import gzip
+import json
+import re
+
+import numpy as np
+import pytest
+import yaml
+from rich.console import Console
+
+import jaxnav
+from jaxnav.cli.eval import main
+from jaxnav.runs import benchmark as benchmarks
+from jaxnav.runs.benchmark import checksum_track, compile_track, load_benchmark, run_benchmark
+
+#: A manifest with few homes and episodes.
+MANIFEST = {
+    "split": "val",
+    "scene_seed": 5,
+    "num_episodes": 12,
+    "episode_seed": 0,
+    "shifts": [0.0, 1.0],
+    "shift_by": "size",
+    "tracks": {"rooms": {"world": "rooms", "num_scenes": 4, "checksums": ["", ""]}},
+}
+
+
+def turn_or_stop(observations):
+    """Turn to the right; Done where the goal is detected."""
+    episodes = np.arange(len(observations["goal"]))
+    is_detected = observations["detections"][episodes, observations["goal"], 0] > 0.5
+    return np.where(is_detected, jaxnav.DONE, jaxnav.ROTATE_RIGHT)
+
+
+@pytest.fixture
+def tiny_benchmark(monkeypatch, tmp_path):
+    """A benchmark `tiny`, with the checksums of its homes."""
+    path = tmp_path / "tiny.yaml"
+    path.write_text(yaml.safe_dump(MANIFEST))
+    monkeypatch.setitem(benchmarks.BENCHMARKS, "tiny", path)
+    benchmark = load_benchmark("tiny")
+    (track,) = benchmark.tracks
+    checksums = []
+    for shift in benchmark.shifts:
+        compiled = compile_track(benchmark, track, shift, Console(quiet=True))
+        checksums.append(checksum_track(benchmark, compiled))
+    path.write_text(path.read_text().replace("checksums:\n    - ''\n    - ''", f"checksums: {checksums}"))
+    return path
+
+
+def read_scores(path):
+    """The scores, and the rows of the episodes."""
+    with gzip.open(path.with_name(path.name.replace(".json", ".episodes.csv.gz")), "rt") as file:
+        return json.loads(path.read_text()), list(csv.DictReader(file))
+
+
+def test_scores_follow_from_the_stored_episodes(tiny_benchmark, tmp_path):
+    scores = run_benchmark(turn_or_stop, "tiny")
+    path = tmp_path / "scores.json"
+    scores.write(path)
+    stored_scores, episodes = read_scores(path)
+    assert stored_scores["rows"] == scores.rows
+    assert {row["variant"] for row in scores.rows} == {"agent", "random", "frontier", "oracle"}
+
+    # Each of the 12 episodes of every row at both shifts; `mixed` counts the 24 of both.
+    for row in scores.rows:
+        row_episodes = []
+        for episode in episodes:
+            is_shift = row["shift"] == "mixed" or float(episode["shift"]) == row["shift"]
+            if episode["variant"] == row["variant"] and episode["track"] == row["track"] and is_shift:
+                row_episodes.append(episode)
+        assert len(row_episodes) == (24 if row["shift"] == "mixed" else 12)
+        success = np.array([int(episode["success"]) for episode in row_episodes])
+        length = np.array([int(episode["length"]) for episode in row_episodes])
+        best_length = np.array([int(episode["best_length"]) for episode in row_episodes])
+        assert row["sr"]["mean"] == pytest.approx(100.0 * success.mean())
+        assert row["spl"]["mean"] == pytest.approx(
+            100.0 * (success * best_length / np.maximum(length, best_length)).mean()
+        )
+        assert row["sr@20"]["mean"] == pytest.approx(100.0 * (success * (length <= 20)).mean())
+
+
+def test_homes_that_differ_from_the_manifest_are_refused(tiny_benchmark):
+    checksum = load_benchmark("tiny").tracks[0].checksums[1]
+    tiny_benchmark.write_text(tiny_benchmark.read_text().replace(checksum, "0" * 16))
+    with pytest.raises(jaxnav.InputError, match="tiny, track rooms: the homes at shift 1 differ"):
+        run_benchmark(turn_or_stop, "tiny")
+
+
+def test_checksum_covers_tables_and_episodes(tiny_benchmark):
+    benchmark = load_benchmark("tiny")
+    (track,) = benchmark.tracks
+    compiled = compile_track(benchmark, track, 0.0, Console(quiet=True))
+    assert checksum_track(benchmark, compiled) == track.checksums[0]
+    assert len(set(track.checksums)) == 2
+    text = tiny_benchmark.read_text().replace("num_episodes: 12", "num_episodes: 13")
+    tiny_benchmark.write_text(text)
+    assert checksum_track(load_benchmark("tiny"), compiled) != track.checksums[0]
+
+
+def test_version_one_is_frozen():
+    benchmark = load_benchmark("v1")
+    assert [track.name for track in benchmark.tracks] == ["rooms", "apartments", "houses"]
+    settings = (benchmark.split, benchmark.scene_seed, benchmark.num_episodes, benchmark.episode_seed)
+    assert settings == ("test", 4101, 1000, 0)
+    assert [track.checksums for track in benchmark.tracks] == [
+        ("5793264d4cc97200", "8914c5a76c4432c4"),
+        ("a4cb85187202557e", "7f3b1100a2a6b9cb"),
+        ("06403312f8ffd70e", "3e5c52342847c96d"),
+    ]
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("name", ["rooms", "apartments", "houses"])
+def test_homes_of_version_one_are_those_of_its_manifest(name):
+    benchmark = load_benchmark("v1")
+    (track,) = [track for track in benchmark.tracks if track.name == name]
+    for shift, checksum in zip(benchmark.shifts, track.checksums, strict=True):
+        compiled = compile_track(benchmark, track, shift, Console(quiet=True))
+        assert checksum_track(benchmark, compiled) == checksum
+
+
+def test_policies_act_only_with_their_categories():
+    with pytest.raises(jaxnav.InputError, match=r"rooms-org.*other categories.*houses"):
+        run_benchmark("rooms-org", "v1", tracks=["houses"])
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (["--benchmark", "v2"], "benchmark 'v2'.*v1"),
+        (["--benchmark", "v1", "--tracks", "gardens"], "track 'gardens'.*rooms, apartments, houses"),
+        (["--benchmark", "v1", "--shift", "1"], "--shift.*fixed"),
+        (["--tracks", "rooms"], "--tracks rooms.*--benchmark"),
+    ],
+)
+def test_impossible_options_are_refused(options, named, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["rooms-org", *options]) == 2
+    assert re.search(named, capsys.readouterr().err)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_command_prints_and_writes_the_scores_of_a_policy(tiny_benchmark, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["rooms-org", "--benchmark", "tiny"]) == 0
+    printed = capsys.readouterr().out
+    assert "SR, shift 0" in printed
+    assert "SR, mixed" in printed
+    scores, episodes = read_scores(tmp_path / "benchmark-tiny-rooms-org.json")
+    assert (scores["benchmark"], scores["subject"]) == ("tiny", "rooms-org")
+    assert {row["variant"] for row in scores["rows"]} >= {"layout", "tde", "stde", "random", "oracle"}
+    assert len({episode["scene"] for episode in episodes}) == 4
