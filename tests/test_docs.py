@@ -1,9 +1,13 @@
 """What the documentation shows is what happens."""
 
 import ast
+import collections
+import csv
 import dataclasses
 import doctest
+import gzip
 import importlib
+import json
 import re
 import runpy
 import sys
@@ -77,6 +81,38 @@ def test_pages_of_commands_are_up_to_date(name):
     assert (DOCS / name).read_text() == load_script("write_commands")["write_pages"]()[name], (
         "run: python docs/write_commands.py"
     )
+
+
+def test_leaderboard_is_up_to_date():
+    assert (DOCS / "leaderboard.md").read_text() == load_script("write_leaderboard")["write_page"](), (
+        "run: python docs/write_leaderboard.py"
+    )
+
+
+LEADERBOARD = sorted((DOCS.parent / "results" / "leaderboard").rglob("*.json"))
+
+
+@pytest.mark.parametrize("path", LEADERBOARD, ids=lambda path: path.stem)
+def test_scores_of_the_leaderboard_follow_from_their_episodes(path):
+    scores = json.loads(path.read_text())
+    assert scores["benchmark"] == path.parent.name
+    episodes_by_line = collections.defaultdict(list)
+    with gzip.open(path.with_name(f"{path.stem}.episodes.csv.gz"), "rt") as file:
+        for episode in csv.DictReader(file):
+            line = (episode["track"], *(episode[name] for name in ("variant", "epsilon", "form", "decoding")))
+            values = (int(episode["success"]), int(episode["length"]), int(episode["best_length"]))
+            episodes_by_line[*line, float(episode["shift"])].append(values)
+            episodes_by_line[*line, "mixed"].append(values)
+
+    # Every score is the mean of its episodes, and every episode counts in two scores.
+    assert len(scores["rows"]) == len(episodes_by_line)
+    for row in scores["rows"]:
+        epsilon = "" if row["epsilon"] is None else str(row["epsilon"])
+        line = (row["track"], row["variant"], epsilon, row["form"] or "", row["decoding"], row["shift"])
+        success, length, best_length = np.array(episodes_by_line[line]).T
+        assert row["sr"]["mean"] == pytest.approx(100.0 * success.mean())
+        path_shares = success * best_length / np.maximum(length, best_length)
+        assert row["spl"]["mean"] == pytest.approx(100.0 * path_shares.mean())
 
 
 def public_names_with_links():

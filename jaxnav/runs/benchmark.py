@@ -24,7 +24,7 @@ from rich.table import Table
 from jaxnav.choices import ShiftKind
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, join_episode_lists
-from jaxnav.evaluation.report import UNTRAINED_VARIANTS, package_versions
+from jaxnav.evaluation.report import UNTRAINED_VARIANTS, package_versions, row_label
 from jaxnav.evaluation.statistics import Interval, mean_interval
 from jaxnav.evaluation.variants import EvaluationRow
 from jaxnav.runs.config import RunConfig, WorldConfig
@@ -211,7 +211,8 @@ def run_benchmark(
             track_results.append(TrackResults(track, shift, results))
     has_runs = isinstance(found_subject, PolicySubject) and found_subject.run is not None
     has_runs = has_runs or (isinstance(found_subject, AgentSubject) and len(found_subject.agents) > 1)
-    return BenchmarkScores(name, found_subject.name, _score_rows(track_results, has_runs), track_results)
+    rows = _score_rows(track_results, found_subject.name, has_runs)
+    return BenchmarkScores(name, found_subject.name, rows, track_results)
 
 
 def scores_table(rows: Sequence[dict[str, Any]]) -> Table:
@@ -239,13 +240,9 @@ def shift_title(shift: float | str) -> str:
 
 
 def score_label(row: dict[str, Any]) -> str:
-    """Name of a way to use an agent: its variant, and the decoding of policies."""
-    parts = [row["variant"]]
-    if row["epsilon"] is not None:
-        parts.append(f"epsilon {row['epsilon']:g}")
-    if row["decoding"] == "sample":
-        parts.append("sampled")
-    return ", ".join(parts)
+    """Name of a way to use an agent, as in tables of evaluations, with the decoding of sampled actions."""
+    suffix = ", sampled" if row["decoding"] == "sample" else ""
+    return row_label(row) + suffix
 
 
 def compile_track(benchmark: Benchmark, track: Track, shift: float, console: Console) -> CompiledWorld:
@@ -292,7 +289,7 @@ def _select_tracks(
     return selected
 
 
-def _score_rows(track_results: Sequence[TrackResults], has_runs: bool) -> list[dict[str, Any]]:
+def _score_rows(track_results: Sequence[TrackResults], subject: str, has_runs: bool) -> list[dict[str, Any]]:
     """Score every way to use the agent on each track: at each shift, and over the episodes of all shifts."""
     score_rows = []
     for track in dict.fromkeys(entry.track for entry in track_results):
@@ -310,7 +307,7 @@ def _score_rows(track_results: Sequence[TrackResults], has_runs: bool) -> list[d
                     values = np.concatenate([metrics[metric][row_index] for metrics in group_metrics], axis=-1)
                     scale = 1.0 if metric == "dts" else 100.0
                     scores[metric] = mean_interval(scale * values, clusters, trained=is_trained).to_json()
-                score_rows.append({"track": track.name, "shift": shift, **row._asdict(), **scores})
+                score_rows.append({"track": track.name, "shift": shift, "method": subject, **row._asdict(), **scores})
     return score_rows
 
 
