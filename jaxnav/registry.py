@@ -1,4 +1,4 @@
-"""Everything that jaxnav offers by name: worlds, methods, policies, experiments, configurations and layout estimators.
+"""What jaxnav offers by name: worlds, methods, policies, experiments, benchmarks, configurations, layout estimators.
 
 `registered` collects the entries from the registries of the package (`WORLDS`, `METHODS`, `EXPERIMENTS` and others),
 and their summaries from docstrings and files. The registries are imported in the functions that read them, so that
@@ -15,7 +15,7 @@ from jaxnav.choices import EstimatorName
 from jaxnav.errors import InputError
 
 #: Kinds of entries.
-Kind = Literal["worlds", "methods", "policies", "experiments", "configurations", "settings"]
+Kind = Literal["worlds", "methods", "policies", "experiments", "benchmarks", "configurations", "settings"]
 #: An entry: `name`, `summary` and further fields of its kind, as JSON.
 Entry = dict[str, Any]
 
@@ -33,6 +33,7 @@ def registered(kind: Kind | None = None) -> dict[Kind, list[Entry]]:
     * `experiments`: `needs_run`, true where a finished run must be given; `scene_files` to import first; and the
       training that an experiment without any results does: training `runs`, `policies` in them, and environment
       `steps` of all policies;
+    * `benchmarks`: `tracks` by name, and the number of `episodes` of each track at each layout shift;
     * `configurations`, `settings`: no further fields.
 
     Args:
@@ -140,6 +141,23 @@ def _list_experiments() -> list[Entry]:
     return entries
 
 
+def _list_benchmarks() -> list[Entry]:
+    from jaxnav.runs.benchmark import BENCHMARKS, load_benchmark
+
+    # The first line of a manifest is a comment that describes it.
+    entries = []
+    for name, path in BENCHMARKS.items():
+        benchmark = load_benchmark(name)
+        entry = {
+            "name": name,
+            "summary": _first_line(path.read_text(encoding="utf-8")).removeprefix("#").strip(),
+            "tracks": [track.name for track in benchmark.tracks],
+            "episodes": benchmark.num_episodes,
+        }
+        entries.append(entry)
+    return entries
+
+
 def _list_configurations() -> list[Entry]:
     from jaxnav.runs.config_files import CONFIGS
 
@@ -167,6 +185,7 @@ _KINDS: Mapping[Kind, Callable[[], list[Entry]]] = {
     "methods": _list_methods,
     "policies": _list_policies,
     "experiments": _list_experiments,
+    "benchmarks": _list_benchmarks,
     "configurations": _list_configurations,
     "settings": _list_settings,
 }

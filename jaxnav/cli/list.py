@@ -13,13 +13,14 @@ from rich.table import Table
 from jaxnav.cli.console import make_result_console, parse_arguments, run_command
 from jaxnav.registry import Entry, Kind, registered
 
-DESCRIPTION = "List worlds, methods, policies, experiments, configurations and layout estimators by name."
+DESCRIPTION = "List worlds, methods, policies, experiments, benchmarks, configurations and layout estimators by name."
 #: Title of the table of each kind, and a command or call for which its names are.
 _TITLES: dict[Kind, tuple[str, str]] = {
     "worlds": ("Generated worlds", "jaxnav train --world NAME, or jaxnav.make(NAME) in Python"),
     "methods": ("Methods", "jaxnav train --method NAME"),
     "policies": ("Packaged policies", "jaxnav sweep NAME, or jaxnav.load_policy(NAME) in Python"),
     "experiments": ("Experiments", "jaxnav study NAME"),
+    "benchmarks": ("Frozen benchmarks", "jaxnav eval SUBJECT --benchmark NAME"),
     "configurations": ("Configurations of a training", "jaxnav train --config NAME --run-dir RUN"),
     "settings": ("Layout estimators and gaps for evaluations", "jaxnav eval RUN --setting NAME"),
 }
@@ -118,6 +119,7 @@ _FORMATTERS: dict[Kind, dict[str, Callable[[Entry], str]]] = {
     },
     "methods": {"Layout": _format_hosts_layout},
     "experiments": {"Needs": _format_needs},
+    "benchmarks": {"Tracks": lambda entry: ", ".join(entry["tracks"])},
     "policies": {
         "Method": lambda entry: f"{entry['method']}",
         "World": lambda entry: f"{entry['world']}",

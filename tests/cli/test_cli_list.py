@@ -48,6 +48,12 @@ def test_entries_hold_the_facts_of_their_kind(entries_by_kind):
     assert (experiments["account"]["runs"], experiments["account"]["steps"]) == (0, 0)
     assert not experiments["study"]["needs_run"]
     assert experiments["accounts"]["scene_files"] == ["ITHOR.jsonl.gz", "ROBOTHOR.jsonl.gz"]
+    (benchmark,) = entries_by_kind["benchmarks"]
+    assert (benchmark["name"], benchmark["tracks"], benchmark["episodes"]) == (
+        "v1",
+        ["rooms", "apartments", "houses"],
+        1000,
+    )
     # Three agents of five seeds, of which one has both arms: 5 M steps each, rounded up to whole chunks.
     assert (experiments["study"]["runs"], experiments["study"]["policies"]) == (3, 20)
     assert 100e6 <= experiments["study"]["steps"] < 102e6
