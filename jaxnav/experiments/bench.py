@@ -3,7 +3,11 @@
 Measurements ask a `Bench` for what they need, and the bench trains, compiles or evaluates what is missing.
 """
 
-from collections.abc import Mapping
+import hashlib
+import io
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +15,7 @@ from rich.console import Console
 
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
+from jaxnav.evaluation.grid import EpisodeOutcome
 from jaxnav.evaluation.variants import EvaluationRow
 from jaxnav.experiments.config import AgentRun, ExperimentConfig, agent_runs
 from jaxnav.experiments.table import ResultRow, ResultTable, read_part
@@ -19,6 +24,7 @@ from jaxnav.runs.policies import load_policies
 from jaxnav.runs.run import Run, load_run_config, run_settings
 from jaxnav.runs.train import train
 from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world
+from jaxnav.store.files import write_atomic
 
 
 class Scores(NamedTuple):
@@ -59,6 +65,8 @@ class Bench:
         self.console = console
         self._runs = {(run.world, run.agent): run for run in agent_runs(config)}
         self._scores: dict[tuple[str, str, float], Scores] = {}
+        #: Folder of the outcomes of a part that is not finished; None to keep none.
+        self.unfinished_folder: Path | None = None
 
     def find_run(self, world: str, agent: str) -> AgentRun | None:
         """Run of an agent in a world, or None if the experiment has no such run."""
@@ -82,6 +90,25 @@ class Bench:
         if best is None:
             raise InputError(f"{folder}: has no trials of {run.name}; epsilon is chosen there: give --split val first")
         return best
+
+    def recall_outcomes(self, name: str, measure: Callable[[], list[EpisodeOutcome]]) -> list[EpisodeOutcome]:
+        """Load the outcomes that an interrupted call stored under a name, or else measure and store them.
+
+        A part can take hours, and must not begin anew after an interruption.
+
+        Args:
+          name: name of the outcomes, unique in the part.
+          measure: measures them.
+        """
+        if self.unfinished_folder is None:
+            return measure()
+        path = self.unfinished_folder / f"{hashlib.sha256(name.encode()).hexdigest()[:16]}.npz"
+        outcomes = _load_outcomes(path)
+        if outcomes is None:
+            outcomes = measure()
+            self.unfinished_folder.mkdir(parents=True, exist_ok=True)
+            _save_outcomes(path, outcomes)
+        return outcomes
 
     def train(self, run: AgentRun) -> None:
         """Train a run unless it is finished with the same settings."""
@@ -147,3 +174,27 @@ class Bench:
                 row_metrics[name] = values[index] * (1.0 if name == "dts" else 100.0)
             metrics_by_row[row] = row_metrics
         return Scores(metrics_by_row, results.episodes, results)
+
+
+def _save_outcomes(path: Path, outcomes: Sequence[EpisodeOutcome]) -> None:
+    """Write outcomes into a file, which is replaced atomically."""
+    arrays = {}
+    for index, outcome in enumerate(outcomes):
+        for field, values in outcome._asdict().items():
+            arrays[f"{index}.{field}"] = np.asarray(values)
+    file = io.BytesIO()
+    np.savez_compressed(file, **arrays)
+    write_atomic(path, file.getvalue())
+
+
+def _load_outcomes(path: Path) -> list[EpisodeOutcome] | None:
+    """Read outcomes; None if there are none, or the file is damaged."""
+    try:
+        with np.load(io.BytesIO(path.read_bytes())) as arrays:
+            num_outcomes = len(arrays.files) // len(EpisodeOutcome._fields)
+            outcomes = []
+            for index in range(num_outcomes):
+                outcomes.append(EpisodeOutcome(*(arrays[f"{index}.{field}"] for field in EpisodeOutcome._fields)))
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile):
+        return None
+    return outcomes

@@ -399,16 +399,16 @@ def part_settings(config: ExperimentConfig, run: AgentRun, references: list[Agen
 
     settings = evaluation_settings(config) | {"run": comparable_settings(run.config)}
     if run.folds:
-        settings["folds"] = {fold.world: _digest(comparable_settings(fold.config)) for fold in run.folds}
+        settings["folds"] = {fold.world: digest_settings(comparable_settings(fold.config)) for fold in run.folds}
     if references:
         digests = {}
         for reference in references:
             reference_name = reference.name if run.folds else reference.agent
-            digests[reference_name] = _digest(comparable_settings(reference.config))
+            digests[reference_name] = digest_settings(comparable_settings(reference.config))
         settings["references"] = digests
     return settings
 
 
-def _digest(settings: dict[str, Any]) -> str:
+def digest_settings(settings: dict[str, Any]) -> str:
     """Digest of settings, equal for equal settings."""
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]

@@ -4,6 +4,8 @@
 decoding rule) has a file of results, so that an interrupted experiment goes on with the first part that is missing.
 """
 
+import glob
+import shutil
 from collections.abc import Callable, Collection, Iterator
 from functools import partial
 from pathlib import Path
@@ -12,11 +14,13 @@ from typing import NamedTuple
 from rich.console import Console
 
 from jaxnav.errors import InputError
+from jaxnav.evaluation.report import package_versions
 from jaxnav.experiments.bench import Bench
 from jaxnav.experiments.config import (
     AgentRun,
     ExperimentConfig,
     check_experiment,
+    digest_settings,
     evaluation_settings,
     join_folds,
     matches_any,
@@ -151,14 +155,20 @@ def run_experiment(config: ExperimentConfig, console: Console) -> list[str]:
     for document, template in config.pages.items():
         check_page(Path(document), template)
     folder = config.results / config.split
-    parts = list_parts(config, Bench(config, console))
+    bench = Bench(config, console)
+    parts = list_parts(config, bench)
     missing_parts = [part for part in parts if not _is_finished(folder, part)]
 
     # Pages are written again after every part. Only the last ones must be without faults.
     for part in missing_parts:
         path = folder / f"{part.name}.jsonl"
         console.print(f"{path}")
+        # Outcomes of a part that was interrupted are kept until the part is finished, for the same versions.
+        part_digest = digest_settings(part.settings | {"versions": package_versions()})
+        bench.unfinished_folder = folder / f"{part.name}-{part_digest}.unfinished"
         write_part(path, part.settings, part.measure())
+        for unfinished_folder in folder.glob(f"{glob.escape(part.name)}-*.unfinished"):
+            shutil.rmtree(unfinished_folder, ignore_errors=True)
         try:
             write_pages(config, parts)
         except InputError as error:

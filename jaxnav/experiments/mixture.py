@@ -11,7 +11,7 @@ outcomes, at each shift and over the mixture.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import jax
@@ -36,6 +36,7 @@ from jaxnav.experiments.trials import (
     mean_removal_weight,
     require_estimator_config,
 )
+from jaxnav.layout import EstimatorConfig
 from jaxnav.runs.policies import EVIDENCE_GAPS, GapName, estimators_by_gap, load_policies
 from jaxnav.runs.worlds import CompiledWorld, concatenate_worlds
 from jaxnav.scenes.worlds import WORLDS
@@ -251,6 +252,19 @@ def _run_removals(
     removals = bench.config.removals
     runner = TrialRunner(bench.config.seed)
 
+    def run_trials(
+        name: str, evaluated_run: EvaluatedRun, estimator: EstimatorConfig | None, trials: Iterable[Trial]
+    ) -> dict[Trial, EpisodeOutcome]:
+        """Run trials, unless an interrupted call finished them."""
+        distinct_trials = list(dict.fromkeys(trials))
+
+        def measure() -> list[EpisodeOutcome]:
+            outcomes = runner.run_trials(evaluated_run, estimator, distinct_trials)
+            return [outcomes[trial] for trial in distinct_trials]
+
+        outcomes = bench.recall_outcomes(f"{run.name}: {name}", measure)
+        return dict(zip(distinct_trials, outcomes, strict=True))
+
     # Both runs meet the same episodes.
     layout_blind = EvaluatedRun(load_policies(layout_blind_run.config, ("baseline",)), world, episodes)
     policies = load_policies(run.config, ("layout",))
@@ -264,12 +278,12 @@ def _run_removals(
 
     # References and removals that follow no gap are evaluated once, for all rules.
     baseline_trial = Trial("baseline", decoding)
-    layout_blind_outcome = runner.run_trials(layout_blind, None, [baseline_trial])[baseline_trial]
+    layout_blind_outcome = run_trials("layout-blind", layout_blind, None, [baseline_trial])[baseline_trial]
     bench.console.print("complete removal and removals that follow no gap")
     fixed_trials = select_removals(list_fixed_trials(decoding, WORLDS[run.config.world].budgets[-1]), removals)
     plain_trial = Trial("layout", decoding)
     hard_trial = Trial("tde", decoding)
-    outcomes = runner.run_trials(evaluated_run, estimator, [plain_trial, hard_trial, *fixed_trials.values()])
+    outcomes = run_trials("plain", evaluated_run, estimator, [plain_trial, hard_trial, *fixed_trials.values()])
 
     hard_controls = {}
     if remaining == "own":
@@ -277,13 +291,13 @@ def _run_removals(
         control_trials = {}
         for name, control in select_removals(HARD_CONTROLS, removals).items():
             control_trials[name] = Trial("tde", decoding, control=control)
-        control_outcomes = runner.run_trials(evaluated_run, estimator, control_trials.values())
+        control_outcomes = run_trials("controls", evaluated_run, estimator, control_trials.values())
         hard_controls = {name: control_outcomes[trial] for name, trial in control_trials.items()}
 
         # A counterfactual memory of its own is compared with the factual one.
         if policies.spec.counterfactual_memory == "own":
             factual_run = evaluated_run._replace(policies=policies.with_counterfactual_memory("factual"))
-            factual_outcomes = runner.run_trials(factual_run, estimator, [hard_trial])
+            factual_outcomes = run_trials("factual memory", factual_run, estimator, [hard_trial])
             hard_controls["TDE, factual memory"] = factual_outcomes[hard_trial]
 
     # Soft removal by each gap, with the controls of its form.
@@ -300,11 +314,11 @@ def _run_removals(
         controls: dict[str, Trial] = {}
         for control in CONTROLS_BY_FORM[rule.options.form]:
             controls[control] = dataclasses.replace(trial, control=control)
-        trial_outcomes = runner.run_trials(evaluated_run, rule_estimator, [trial, *controls.values()])
+        trial_outcomes = run_trials(name, evaluated_run, rule_estimator, [trial, *controls.values()])
         rule_outcomes[name] = trial_outcomes[trial]
         rule_controls[name] = {control: trial_outcomes[control_trial] for control, control_trial in controls.items()}
         if rule.gap in EVIDENCE_GAPS:
-            permuted_outcomes = runner.run_trials(permuted_run, rule_estimator, [trial])
+            permuted_outcomes = run_trials(f"{name}, permuted", permuted_run, rule_estimator, [trial])
             rule_controls[name][PERMUTED_CONTROL] = permuted_outcomes[trial]
 
     return RemovalOutcomes(

@@ -114,6 +114,32 @@ def test_driver_reuses_everything_the_second_time(measured, tmp_path):
     assert "By hand." in document.read_text()
 
 
+def test_driver_keeps_unfinished_outcomes_only_until_a_part_is_finished(tmp_path, monkeypatch):
+    folders = []
+
+    def measure(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
+        folders.append(bench.unfinished_folder)
+        assert bench.unfinished_folder is not None
+        bench.unfinished_folder.mkdir(parents=True, exist_ok=True)
+        if len(folders) == 1:
+            raise KeyboardInterrupt
+        yield ResultRow(world=run.world, run=run.agent, metric="spl", value=Interval(25.0))
+
+    monkeypatch.setattr(driver, "MEASUREMENTS", {"whole": Measurement(measure)})
+    config = make_config(tmp_path, measure={"whole": ["b"]})
+    with pytest.raises(KeyboardInterrupt):
+        run_experiment(config, QUIET)
+    assert folders[0].is_dir()
+    run_experiment(config, QUIET)
+    assert folders == [folders[0]] * 2
+    assert not folders[0].exists()
+
+    # Other settings have other outcomes.
+    changed_config = dataclasses.replace(config, episodes=7, results=tmp_path / "others")
+    run_experiment(changed_config, QUIET)
+    assert folders[2].name != folders[0].name
+
+
 def truncate(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-9])
 

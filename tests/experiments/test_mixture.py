@@ -29,7 +29,7 @@ from jaxnav.experiments.mixture import (
     select_removals,
 )
 from jaxnav.experiments.table import ResultTable
-from jaxnav.experiments.trials import NEVER
+from jaxnav.experiments.trials import NEVER, TrialRunner
 from jaxnav.runs.evaluate import evaluate
 from jaxnav.runs.policies import EVIDENCE_GAPS
 
@@ -270,6 +270,42 @@ def test_folds_of_a_dataset_count_as_one_world(make_bench, drawn_run):
             num_compared += 1
     # Two agents, their lead and the change by removal at two shifts, and the change over the mixture.
     assert num_compared == len(METRICS) * (4 * 2 + 1)
+
+
+@pytest.mark.slow
+def test_interrupted_mixtures_keep_finished_outcomes(make_bench, drawn_run, tmp_path, monkeypatch):
+    run = {"run": str(drawn_run.config.run_dir)}
+    settings = {"agents": {"main": run, "anonymous": run}, "shifts": (0.0, 1.0), "removals": (), "episodes": 4}
+    calls = []
+    run_trials = TrialRunner.run_trials
+
+    def count_calls(runner, *arguments):
+        calls.append(arguments)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return run_trials(runner, *arguments)
+
+    def measure(folder):
+        bench = make_bench(**settings)
+        bench.unfinished_folder = folder
+        return [row.to_json() for row in measure_handover(bench, bench.find_run("rooms", "main"), "argmax", ())]
+
+    expected_rows = measure(None)
+    monkeypatch.setattr(TrialRunner, "run_trials", count_calls)
+    with pytest.raises(KeyboardInterrupt):
+        measure(tmp_path)
+
+    # The layout-blind agents are not run again, and nothing is run the third time.
+    assert measure(tmp_path) == expected_rows
+    assert len(calls) == 3
+    assert measure(tmp_path) == expected_rows
+    assert len(calls) == 3
+
+    # What is damaged is measured again.
+    for path in tmp_path.iterdir():
+        path.write_bytes(path.read_bytes()[:50])
+    assert measure(tmp_path) == expected_rows
+    assert len(calls) == 5
 
 
 @pytest.mark.exhaustive
