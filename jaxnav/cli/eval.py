@@ -178,8 +178,7 @@ def _run_benchmark(config: EvalConfig, console: Console) -> None:
     for name in _POLICY_OPTIONS:
         if getattr(config, name) != getattr(EvalConfig, name):
             policy_options[name] = getattr(config, name)
-    target = config.json or Path(f"benchmark-{config.benchmark}-{name_subject(config.subject)}.json")
-    refuse_folder(target, "--json")
+    target = _find_target(config)
 
     scores = run_benchmark(
         config.subject, str(config.benchmark), config.tracks or None, console=console, **policy_options
@@ -249,6 +248,13 @@ def _find_target(config: EvalConfig) -> Path:
     )
     # Results of a run lie in its directory; others in the working directory, with the name of the subject.
     folder = expand_home(config.subject)
+    if config.benchmark is not None:
+        # Scores lie in the working directory.
+        command = f"benchmark-{config.benchmark}-{name_subject(config.subject)}"
+        name = name_evaluation(command, "-".join(config.tracks) or "all", None, None, *details)
+        target = config.json or Path(f"{name}.json")
+        refuse_folder(target, "--json")
+        return target
     command = "eval"
     is_agent = ":" in config.subject and not folder.exists()
     if is_agent or is_policy(config.subject):

@@ -153,6 +153,17 @@ def test_eval_report_names_differ_for_a_world_and_a_file():
     assert re.fullmatch("run/eval-scenes-rooms-[0-9a-f]{8}-val.json", report_names[2])
 
 
+def test_scores_of_other_settings_have_other_files():
+    config = EvalConfig("rooms-org", benchmark="v1")
+    configs = [config, dataclasses.replace(config, subject="runs/rooms")]
+    configs += [dataclasses.replace(config, tracks=tracks) for tracks in (("rooms",), ("rooms", "houses"))]
+    for name in ("epsilon", "form", "setting", "hold", "inner_steps", "removal", "counterfactual_memory", "costs"):
+        configs += [dataclasses.replace(config, **{name: value}) for value in OTHER_OPTIONS[name]]
+    targets = [str(_find_target(config)) for config in configs]
+    assert targets[0] == "benchmark-v1-rooms-org-all.json"
+    assert len(set(targets)) == len(configs)
+
+
 #: For every option that changes an evaluation, other values than the default.
 OTHER_OPTIONS = {
     "split": ("train", "test"),
@@ -178,7 +189,7 @@ OTHER_OPTIONS = {
 
 def test_evaluations_of_other_settings_have_other_files():
     fields = {field.name for field in dataclasses.fields(EvalConfig)}
-    assert OTHER_OPTIONS.keys() == fields - {"subject", "json", "format"}
+    assert OTHER_OPTIONS.keys() == fields - {"subject", "json", "format", "benchmark", "tracks"}
 
     run_path = Path("run")
     configs = [EvalConfig(str(run_path)), EvalConfig(str(run_path), seed=1, hold=True)]

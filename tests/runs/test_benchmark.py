@@ -150,7 +150,7 @@ def test_command_prints_and_writes_the_scores_of_a_policy(tiny_benchmark, capsys
     printed = capsys.readouterr().out
     assert "SR, shift 0" in printed
     assert "SR, mixed" in printed
-    scores, episodes = read_scores(tmp_path / "benchmark-tiny-rooms-org.json")
+    scores, episodes = read_scores(tmp_path / "benchmark-tiny-rooms-org-all.json")
     assert (scores["benchmark"], scores["subject"]) == ("tiny", "rooms-org")
     assert {row["variant"] for row in scores["rows"]} >= {"layout", "tde", "stde", "random", "oracle"}
     assert len({episode["scene"] for episode in episodes}) == 4
