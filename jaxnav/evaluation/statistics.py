@@ -149,13 +149,7 @@ def paired_difference(
     Raises:
       InputError: see `mean_interval`; or the shapes of `reference` and `compared` differ.
     """
-    reference = _as_finite_results("a", reference, scenes)
-    compared = _as_finite_results("b", compared, scenes)
-    if reference.shape != compared.shape:
-        raise InputError(
-            f"reference has shape {reference.shape} and compared has shape {compared.shape}; evaluate both on equal "
-            "runs and episodes"
-        )
+    reference, compared = _as_paired_results(reference, compared, scenes)
 
     # With the same networks, or with fixed policies, the differences themselves are results [S, E].
     difference = compared - reference
@@ -231,13 +225,7 @@ def probability_of_improvement(
     Raises:
       InputError: see `paired_difference`.
     """
-    reference = _as_finite_results("reference", reference, scenes)
-    compared = _as_finite_results("compared", compared, scenes)
-    if reference.shape != compared.shape:
-        raise InputError(
-            f"reference has shape {reference.shape} and compared has shape {compared.shape}; evaluate both on equal "
-            "runs and episodes"
-        )
+    reference, compared = _as_paired_results(reference, compared, scenes)
     reference_means = _means_by_cluster(reference, scenes)
     compared_means = _means_by_cluster(compared, scenes)
     num_runs, num_plans = reference_means.shape
@@ -383,6 +371,18 @@ def _mean_over_runs(values: np.ndarray, scenes: Clusters) -> Interval:
     replicates = runs.weights.T @ values @ scenes.weights / values.size
     run_means = values.mean(axis=1)
     return jackknife_interval(replicates, scenes, runs, std=_std(run_means), seeds=tuple(run_means.tolist()))
+
+
+def _as_paired_results(reference: np.ndarray, compared: np.ndarray, scenes: Clusters) -> tuple[np.ndarray, np.ndarray]:
+    """Convert two sides of a comparison to float64 [S, E], and check that their shapes are equal."""
+    reference = _as_finite_results("reference", reference, scenes)
+    compared = _as_finite_results("compared", compared, scenes)
+    if reference.shape != compared.shape:
+        raise InputError(
+            f"reference has shape {reference.shape} and compared has shape {compared.shape}; evaluate both on equal "
+            "runs and episodes"
+        )
+    return reference, compared
 
 
 def _as_finite_results(name: str, values: np.ndarray, scenes: Clusters) -> np.ndarray:
