@@ -286,11 +286,7 @@ def read_json_texts(path: Path) -> list[tuple[str, bytes]]:
     # The first line is JSON by itself only in a file of lines; the name decides for damaged files.
     has_json_lines = path.name.removesuffix(".gz").endswith(".jsonl")
     if text_lines and not has_json_lines:
-        try:
-            parse_json(str(path), text_lines[0][1])
-            has_json_lines = True
-        except InputError:
-            has_json_lines = False
+        has_json_lines = _is_json(text_lines[0][1])
     if not has_json_lines:
         return [(str(path), content)]
     return [(f"{path}, line {line_number}", line_bytes) for line_number, line_bytes in text_lines]
@@ -309,16 +305,45 @@ def max_decompressed_size(compressed_size: int) -> int:
     return max(2**26, 50 * compressed_size)
 
 
+def _is_json(text: bytes) -> bool:
+    """True for JSON, with or without a byte order mark."""
+    try:
+        json.loads(text.decode("utf-8-sig"))
+    except (ValueError, RecursionError):
+        return False
+    return True
+
+
+class _RepeatedFieldError(Exception):
+    """A JSON object that gives a field twice."""
+
+
 def parse_json(location: str, text: bytes) -> Any:
     """Parse JSON, with or without a byte order mark.
 
     Raises:
-      InputError: the bytes are not JSON.
+      InputError: the bytes are not JSON, or an object gives a field twice, so that one of its values would be lost.
     """
     try:
-        return json.loads(text.decode("utf-8-sig"))
+        return json.loads(text.decode("utf-8-sig"), object_pairs_hook=_collect_fields)
+    except _RepeatedFieldError as error:
+        raise InputError(f"{location}: an object gives {error} twice; give every field of an object once") from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"{location}: not JSON ({error}); give valid JSON") from error
+
+
+def _collect_fields(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Collect the fields of a JSON object.
+
+    Raises:
+      _RepeatedFieldError: names the first field that is given twice.
+    """
+    fields: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in fields:
+            raise _RepeatedFieldError(reprlib.repr(name))
+        fields[name] = value
+    return fields
 
 
 # From JSON to scenes

@@ -85,6 +85,9 @@ compressed = functools.partial(gzip.compress, mtime=0)
         (compressed(b"\xff\xfe"), "line 1: not JSON"),
         (compressed(b"[" * 100_000), "line 1: not JSON"),
         (compressed(b"[1]"), "line 1: [1]"),
+        # One of the two values would be lost.
+        (compressed(b'{"name": "den", "name": "attic"}'), "line 1: an object gives 'name' twice"),
+        (compressed(b'{"objects": [{"x": 1, "x": 2}]}'), "line 1: an object gives 'x' twice"),
     ],
 )
 def test_read_scenes_refuses_broken_files(tmp_path, file_bytes, expected_part):
