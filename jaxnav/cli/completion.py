@@ -35,7 +35,7 @@ _jaxnav_or_files() {
 complete -o default -F _jaxnav_or_files jaxnav
 """
 #: Longest description of an option, in characters: fish passes the script as an argument of at most 128 KiB.
-_MAX_DESCRIPTION = 60
+_MAX_DESCRIPTION = 34
 
 #: Rules by which tyro turns dataclasses into options with short descriptions.
 _SHORT_REGISTRY = ConstructorRegistry()
