@@ -76,7 +76,13 @@ DIGEST_KEY = "digest"
 
 
 def add_digest(record: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a record, converted to plain JSON values, with the digest of its content."""
+    """Return a record, converted to plain JSON values, with the digest of its content.
+
+    Raises:
+      ValueError: the record has a field of that name, which would be lost.
+    """
+    if DIGEST_KEY in record:
+        raise ValueError(f"the field {DIGEST_KEY!r} is the digest of the record; give another name")
     plain_record = json.loads(json.dumps(record, allow_nan=False))
     return plain_record | {DIGEST_KEY: _record_digest(plain_record)}
 

@@ -69,7 +69,11 @@ def test_missing_log_has_no_rows(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@given(st.dictionaries(st.text(), st.none() | st.integers() | st.floats(allow_nan=False, allow_infinity=False)))
+#: Names of fields; the digest is added.
+field_names = st.text().filter(lambda name: name != "digest")
+
+
+@given(st.dictionaries(field_names, st.none() | st.integers() | st.floats(allow_nan=False, allow_infinity=False)))
 def test_log_rows_of_any_content_round_trip_and_survive_truncation(tmp_path_factory, row):
     log_file = tmp_path_factory.getbasetemp() / "any.jsonl"
     log_file.unlink(missing_ok=True)
@@ -78,6 +82,13 @@ def test_log_rows_of_any_content_round_trip_and_survive_truncation(tmp_path_fact
     assert read_log_rows(log_file) == [row | {"step": 1}]
     truncate_log_after(log_file, 1)
     assert log_file.read_bytes() == content_before
+
+
+def test_a_row_whose_own_digest_would_be_lost_is_refused(log_path):
+    content_before = log_path.read_bytes()
+    with pytest.raises(ValueError, match="'digest' is the digest of the record; give another name"):
+        append_log_rows(log_path, [{"step": 40, "digest": 1.0}])
+    assert log_path.read_bytes() == content_before
 
 
 def test_a_folder_in_place_of_a_log_is_refused(tmp_path):
