@@ -45,6 +45,8 @@ def apply_yaml(default: Config, source: str | Path, configs: Mapping[str, Path] 
     dataclasses. A float field also accepts whole numbers, and text such as `3e-4` (which is text in YAML 1.1). Numbers
     that YAML 1.1 reads as octal or in base 60 are refused, and so are those beyond the range of floats.
 
+    A file with the key `extends` changes the configuration that it names, instead of `default`.
+
     Args:
       default: instance of a frozen dataclass.
       source: name of a packaged configuration, or a YAML file; an empty file changes nothing.
@@ -57,9 +59,19 @@ def apply_yaml(default: Config, source: str | Path, configs: Mapping[str, Path] 
       InputError: the file is missing or is no YAML mapping, has a key twice, an unknown key or a value of another type.
         The message names the file, the line or dotted key, and a remedy.
     """
-    path = configs.get(str(source)) or expand_home(source)
+    return _apply_file(default, configs.get(str(source)) or expand_home(source), configs, extended_by=())
+
+
+def _apply_file(default: Config, path: Path, configs: Mapping[str, Path], extended_by: tuple[Path, ...]) -> Config:
+    if path in extended_by:
+        raise InputError(f"{path}: extends itself; name another configuration in extends")
     values = _load_yaml(path, configs)
-    return default if values is None else apply_values(default, values, path)
+    if isinstance(values, dict) and "extends" in values:
+        # The extended configuration comes first, so that the values of this file replace its own.
+        extended_source = str(values.pop("extends"))
+        extended_path = configs.get(extended_source) or path.parent / expand_home(extended_source)
+        default = _apply_file(default, extended_path, configs, (*extended_by, path))
+    return default if not values else apply_values(default, values, path)
 
 
 def parse_setting(text: str, annotation: Any) -> Any:

@@ -220,6 +220,28 @@ def test_apply_yaml_reads_packaged_configurations_by_name():
     assert apply_yaml(RunConfig(), Path("smoke")).seeds == 1
 
 
+def test_a_file_may_extend_another(tmp_path):
+    (tmp_path / "first.yaml").write_text("name: first\nppo: {learning_rate: 0.5}\nepsilons: [1, 2]\n")
+    (tmp_path / "second.yaml").write_text("extends: first.yaml\nname: second\nppo: {clip: 0.1}\n")
+    (tmp_path / "third.yaml").write_text("extends: packaged\nepsilons: []\n")
+    configs = {"packaged": tmp_path / "second.yaml"}
+
+    # Sections are merged, field by field; lists are replaced.
+    second = Config(ppo=Ppo(learning_rate=0.5, clip=0.1, epochs=2), name="second", epsilons=(1.0, 2.0))
+    assert apply_yaml(Config(), tmp_path / "second.yaml") == second
+    assert apply_yaml(Config(), tmp_path / "third.yaml", configs) == dataclasses.replace(second, epsilons=())
+
+
+def test_a_file_may_not_extend_itself_or_a_missing_file(tmp_path):
+    (tmp_path / "first.yaml").write_text("extends: second.yaml\n")
+    (tmp_path / "second.yaml").write_text("extends: first.yaml\n")
+    (tmp_path / "third.yaml").write_text("extends: none.yaml\n")
+    with pytest.raises(InputError, match=r"first\.yaml: extends itself; name another configuration"):
+        apply_yaml(Config(), tmp_path / "first.yaml")
+    with pytest.raises(InputError, match=r"none\.yaml: no such configuration; give"):
+        apply_yaml(Config(), tmp_path / "third.yaml")
+
+
 @given(
     st.builds(
         Config,
