@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from jaxnav.policies.spec import PolicySpec
     from jaxnav.policies.testing import check_method
     from jaxnav.registry import registered
+    from jaxnav.runs.batch import train_batch
     from jaxnav.runs.config import RunConfig
     from jaxnav.runs.evaluate import Sweep, evaluate, sweep
     from jaxnav.runs.policies import Policies
@@ -127,6 +128,7 @@ __all__ = [
     "standable_cells",
     "sweep",
     "train",
+    "train_batch",
     "unpack_features",
 ]
 
@@ -145,6 +147,7 @@ _NAMES_BY_MODULE = {
     "policies.spec": ("PolicySpec",),
     "policies.testing": ("check_method",),
     "registry": ("registered",),
+    "runs.batch": ("train_batch",),
     "runs.config": ("RunConfig",),
     "runs.evaluate": ("Sweep", "evaluate", "sweep"),
     "runs.policies": ("Policies",),

@@ -16,7 +16,7 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -47,7 +47,7 @@ from jaxnav.runs.preparation import (
     load_preparation,
     save_preparation,
 )
-from jaxnav.runs.run import REACH_FILE, TIMES_FILE, Run, RunLogs, lock_run_dir, run_settings
+from jaxnav.runs.run import REACH_FILE, TIMES_FILE, Run, RunLogs, claim_run_dir, lock_run_dir, run_settings
 from jaxnav.runs.validation import SCORE_METRIC, Validator
 from jaxnav.runs.worlds import (
     CompiledWorld,
@@ -101,8 +101,12 @@ _TIMES_WIDTH = 17
 _CHUNKS_PER_LINE = 4
 
 
+#: Called after every chunk of updates with the chunk's rows of the training log, one for each arm and seed.
+TrainCallback = Callable[[Sequence[LogRow]], None]
+
+
 @exit_if_process_lost()
-def train(config: RunConfig, console: Console | None = None) -> Run:
+def train(config: RunConfig, console: Console | None = None, callback: TrainCallback | None = None) -> Run:
     """Train a run and export its policies.
 
     Training resumes from the last checkpoint of the run directory if there is one.
@@ -110,6 +114,8 @@ def train(config: RunConfig, console: Console | None = None) -> Run:
     Args:
       config: configuration of the run.
       console: console for progress; None for silence.
+      callback: called after every chunk of `config.chunk` updates with the rows of the training log (`Run.log`) that
+        the chunk adds. An exception ends the training, which then resumes from its last checkpoint.
 
     Returns:
       The finished run.
@@ -118,9 +124,24 @@ def train(config: RunConfig, console: Console | None = None) -> Run:
       InputError: a setting is impossible, the run directory holds something else or is in use, or files are damaged.
       Interrupted: Ctrl-C or SIGTERM came during training. The run is saved, and the same call resumes it.
     """
+    config = check_config_and_method(config)
+    train_points(config, [config], console, callback)
+    return Run(config)
+
+
+def train_points(
+    config: RunConfig, points: Sequence[RunConfig], console: Console | None, callback: TrainCallback | None
+) -> None:
+    """Train runs side by side that differ in traced settings of PPO alone, and export the policies of each.
+
+    Args:
+      config: checked configuration that all share, with the directory of the training state; its seeds are those of
+        all points.
+      points: checked configurations of the runs.
+      console, callback: see `train`.
+    """
     require_float32()
     stopwatch = Stopwatch.start()
-    config = _check_config_and_method(config)
     mesh = connect_devices(config)
     if console is None or not is_first_process():
         console = Console(quiet=True)
@@ -129,24 +150,28 @@ def train(config: RunConfig, console: Console | None = None) -> Run:
     check_agreement(json.dumps(make_manifest(run_settings(config))))
     world = compile_training_world(config, console)
     manifest_fields = {"scenes_fingerprint": world.fingerprint, "budget": config.steps_by_purpose}
+    if len(points) > 1:
+        ppo_settings = [run_settings(point)["ppo"] for point in points]
+        manifest_fields["points"] = {name: [settings[name] for settings in ppo_settings] for name in ppo_settings[0]}
     manifest = make_manifest(run_settings(config) | manifest_fields)
     check_agreement(json.dumps(manifest))
 
     with lock_run_dir(config) as lock:
-        _train_in_run_dir(config, world, manifest, mesh, lock, stopwatch, console)
-    return Run(config)
+        _train_in_run_dir(config, points, world, manifest, mesh, lock, stopwatch, console, callback)
 
 
 def _train_in_run_dir(
     config: RunConfig,
+    points: Sequence[RunConfig],
     world: CompiledWorld,
     manifest: dict[str, Any],
     mesh: Mesh | None,
     lock: FolderLock,
     stopwatch: "Stopwatch",
     console: Console,
+    callback: TrainCallback | None,
 ) -> None:
-    """Train in a run directory whose lock is held; see `train`."""
+    """Train in a run directory whose lock is held; see `train_points`."""
     warn_if_rollout_too_short(config, console)
     warn_if_more_steps(config, console)
     preparation = prepare_training(config, world, manifest, console)
@@ -156,7 +181,7 @@ def _train_in_run_dir(
         return
 
     # Draw the bank of scenes in which each chunk trains.
-    trainer = make_trainer(config, world.env, estimator_config, knowledge, mesh)
+    trainer = make_trainer(config, world.env, estimator_config, knowledge, mesh, points)
     bank_order = draw_bank_order(world, config.seed, config.total_updates // config.chunk)
     if len(world.banks) > 1:
         num_used = len(set(bank_order))
@@ -170,22 +195,32 @@ def _train_in_run_dir(
     is_finished = update == config.total_updates and (config.run_dir / REACH_FILE).exists()
     validator = None if is_finished else _make_validator(config, trainer, knowledge, world, console)
 
-    session = TrainingSession(config, trainer, validator, world, bank_order, manifest, lock, stopwatch, console)
+    session = TrainingSession(
+        config, trainer, validator, world, bank_order, manifest, lock, stopwatch, console, callback
+    )
     states = run_updates(session, states, update)
 
-    # Export the best policies, and measure them.
-    policies = {}
-    for arm, seed_states in trainer.unpack(states).items():
-        policies[arm] = [_best_params(state) for state in seed_states]
-    run_on_first_process(lambda: _export_policies(config, policies, estimator_config, knowledge, exploration))
-    if validator is not None:
-        with console.status("measuring the exported policies"):
-            success_by_budget = validator.success_by_budget(policies)
-        run_on_first_process(lambda: write_json_with_digest(config.run_dir / REACH_FILE, success_by_budget))
+    # Export the best policies of each run, and measure them.
+    seed_states = trainer.unpack(states)
+    first_seed = 0
+    for point in points:
+        policies = {}
+        for arm, arm_states in seed_states.items():
+            point_states = arm_states[first_seed : first_seed + point.seeds]
+            policies[arm] = [_best_params(state) for state in point_states]
+        first_seed += point.seeds
+        run_on_first_process(functools.partial(claim_run_dir, point))
+        export = functools.partial(_export_policies, point, policies, estimator_config, knowledge, exploration)
+        run_on_first_process(export)
+        if validator is not None:
+            with console.status("measuring the exported policies"):
+                success_by_budget = validator.success_by_budget(policies)
+            write_reach = functools.partial(write_json_with_digest, point.run_dir / REACH_FILE, success_by_budget)
+            run_on_first_process(write_reach)
     console.print(f"{config.run_dir}: done in {stopwatch.read()['wall_s']:.0f} s")
 
 
-def _check_config_and_method(config: RunConfig) -> RunConfig:
+def check_config_and_method(config: RunConfig) -> RunConfig:
     """Complete and check a configuration, and check a method of another package.
 
     Raises:
@@ -329,8 +364,7 @@ def calibrate_estimator(
     Values that the run's configuration leaves open are calibrated in the training scenes of the first bank.
     """
     estimator_config = named_estimator(config)
-    policy_class = config.policy_method.policy_class
-    if policy_class is not None and policy_class.has_additive_scores:
+    if config.has_additive_scores:
         estimator_config = dataclasses.replace(estimator_config, form="paper")  # removes from a sum
     if estimator_config.strength is None:
         return estimator_config  # `paper` and `released` keep the sums of the counts, so nothing is calibrated
@@ -455,7 +489,12 @@ def _finish_fitted_run(
 
 
 def make_trainer(
-    config: RunConfig, env: ObjectNav, estimator_config: EstimatorConfig, knowledge: Knowledge, mesh: Mesh | None = None
+    config: RunConfig,
+    env: ObjectNav,
+    estimator_config: EstimatorConfig,
+    knowledge: Knowledge,
+    mesh: Mesh | None = None,
+    points: Sequence[RunConfig] | None = None,
 ) -> Trainer:
     """Make the trainer of all arms and seeds of a run.
 
@@ -465,6 +504,8 @@ def make_trainer(
       estimator_config: layout estimator. Training does not use the gap, so it is switched off.
       knowledge: knowledge from before training.
       mesh: mesh of devices; None for one device.
+      points: runs that are trained side by side, which differ from `config` in traced settings of PPO alone; the seeds
+        of each follow those of the one before. None for the run itself.
     """
     policy_spec = config.policy_spec(len(env.categories))
     # Training episodes may start near their goals.
@@ -477,15 +518,25 @@ def make_trainer(
         agent_loop = AgentLoop(env, policy_spec, arm_estimators[arm])
         learners[arm] = Learner(agent_loop, config.ppo, config.counterfactual)
 
+    # Traced settings of each policy, stacked for each stage.
+    points = [config] if points is None else points
+    scalars_by_policy = []
+    for point in points:
+        point_scalars = point.ppo.stage_scalars(config.stages, config.stage_by_chunk, config.chunk)
+        scalars_by_policy += [point_scalars] * point.seeds
+    stage_scalars = []
+    for policy_scalars in zip(*scalars_by_policy, strict=True):
+        stage_scalars.append(jax.tree.map(lambda *leaves: jnp.stack(leaves), *policy_scalars))
+
     # With a mesh, seeds and environments are sharded over its devices.
     trainer_class = Trainer if mesh is None else functools.partial(ShardedTrainer, mesh=mesh)
     return trainer_class(
         learners,
         stages=config.stages,
-        stage_scalars=config.ppo.stage_scalars(config.stages, config.stage_by_chunk, config.chunk),
+        stage_scalars=stage_scalars,
         knowledge=knowledge,
         key=jax.random.key(config.seed),
-        num_seeds=config.seeds,
+        seeds=[seed for point in points for seed in range(point.seeds)],
         chunk_size=config.chunk,
     )
 
@@ -543,6 +594,7 @@ class TrainingSession:
       lock: lock of the run directory.
       stopwatch: seconds of the run.
       console: console for progress.
+      callback: called with the log rows of every chunk.
     """
 
     config: RunConfig
@@ -554,6 +606,7 @@ class TrainingSession:
     lock: FolderLock
     stopwatch: "Stopwatch"
     console: Console
+    callback: TrainCallback | None = None
 
 
 def run_updates(session: TrainingSession, states: TrainerStates, update: int) -> TrainerStates:
@@ -593,14 +646,16 @@ def run_updates(session: TrainingSession, states: TrainerStates, update: int) ->
             run_on_first_process(session.lock.check)
 
             # Write the log, and the checkpoint if due.
+            log_rows = _log_rows(config, metrics, update)
             if is_first_process():
-                time_row = {"step": update} | session.stopwatch.read()
-                RunLogs(config).append(_log_rows(config, metrics, update), time_row)
+                RunLogs(config).append(log_rows, {"step": update} | session.stopwatch.read())
             is_save_due = update % (config.chunk * config.save_every) == 0 or update == config.total_updates
             if signal_number or is_save_due:
                 save_checkpoint(config.run_dir, update, trainer.unpack(states), session.manifest)
 
             progress.show_chunk(metrics, update)
+            if session.callback is not None:
+                session.callback(log_rows)
             if signal_number:
                 break
 

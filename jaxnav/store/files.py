@@ -231,6 +231,11 @@ def append_log_rows(path: Path, rows: Sequence[LogRow]) -> None:
         os.fsync(log_file.fileno())
 
 
+def write_log_rows(path: Path, rows: Sequence[LogRow]) -> None:
+    """Write a log, which replaces the file atomically."""
+    write_atomic(path, _encode_rows(rows))
+
+
 def read_log_rows(path: Path) -> list[dict[str, Any]]:
     """Read the rows of a log in order.
 
@@ -268,7 +273,7 @@ def truncate_log_after(path: Path, step: int) -> None:
     """
     if path.exists():
         remaining_rows = [row for row in read_log_rows(path) if row["step"] <= step]
-        write_atomic(path, _encode_rows(remaining_rows))
+        write_log_rows(path, remaining_rows)
 
 
 def _encode_rows(rows: Sequence[LogRow]) -> bytes:

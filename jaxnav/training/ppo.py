@@ -745,8 +745,17 @@ class Learner:
     counterfactual: CounterfactualTraining
     stage: Stage = Stage()
 
-    def init(self, key: jax.Array, env_params: EnvParams, knowledge: Knowledge) -> LearnerState:
-        """Initial state of one training seed."""
+    def init(
+        self, key: jax.Array, env_params: EnvParams, knowledge: Knowledge, experience_prob: jax.Array | None = None
+    ) -> LearnerState:
+        """Initial state of one training seed.
+
+        Args:
+          key: typed PRNG key [] of the seed.
+          env_params: parameters of the training environment.
+          knowledge: knowledge from before training.
+          experience_prob: float32 [], probability that an episode has experience; None for that of `config`.
+        """
         init_key = jax.random.fold_in(key, _INIT)
         start_key = jax.random.fold_in(key, _START)
         update_key = jax.random.fold_in(key, _UPDATES)
@@ -757,15 +766,21 @@ class Learner:
             params=policy_params,
             best=BestPolicy(params=policy_params, score=jnp.float32(-1.0), update=jnp.int32(0)),
             opt_state=make_optimizer(self.config).init(policy_params),
-            agent=self._start_episodes(policy_params, start_key, env_params, knowledge),
+            agent=self._start_episodes(policy_params, start_key, env_params, knowledge, experience_prob),
             key=update_key,
             update=jnp.int32(0),
         )
 
-    def restart_episodes(self, state: LearnerState, env_params: EnvParams, knowledge: Knowledge) -> LearnerState:
+    def restart_episodes(
+        self,
+        state: LearnerState,
+        env_params: EnvParams,
+        knowledge: Knowledge,
+        experience_prob: jax.Array | None = None,
+    ) -> LearnerState:
         """Start new episodes in the scenes of `env_params`; parameters and optimizer state are kept."""
         key = jax.random.fold_in(jax.random.fold_in(state.key, state.update), _RESTART)
-        return state.replace(agent=self._start_episodes(state.params, key, env_params, knowledge))
+        return state.replace(agent=self._start_episodes(state.params, key, env_params, knowledge, experience_prob))
 
     def keep_if_best(self, state: LearnerState, score: jax.Array) -> LearnerState:
         """Keep the current policy as the best one unless an earlier score, float32 [], is higher."""
@@ -914,14 +929,21 @@ class Learner:
         return loss_fn(replay, advantages, scalars, use_distillation, self.agent_loop.method)
 
     def _start_episodes(
-        self, policy_params: Params, key: jax.Array, env_params: EnvParams, knowledge: Knowledge
+        self,
+        policy_params: Params,
+        key: jax.Array,
+        env_params: EnvParams,
+        knowledge: Knowledge,
+        experience_prob: jax.Array | None,
     ) -> Agent:
         """Start an episode in every environment, and draw its experience dropout."""
         num_envs = self.config.num_envs
-        experience_prob = self._experience_prob(self.config.experience_prob)
+        dropout_prob = self._experience_prob(
+            self.config.experience_prob if experience_prob is None else experience_prob
+        )
         memory = self.agent_loop.bind(policy_params).initial_memory((num_envs,))
         dropout_key = jax.random.fold_in(key, _START_DROPOUT)
-        memory = sample_experience_dropout(memory, True, dropout_key, experience_prob)
+        memory = sample_experience_dropout(memory, True, dropout_key, dropout_prob)
         return self.agent_loop.start(key, num_envs, memory, knowledge, env_params)
 
     def _experience_prob(self, experience_prob: jax.Array | float) -> jax.Array | float:

@@ -38,6 +38,8 @@ ARM_KEY_PURPOSES = {"baseline": 0, "layout": 1}
 class Trainer:
     """Trainer of all arms and seeds of a run on one device.
 
+    Policies of one arm may also differ in the traced settings of PPO; *seed* then means one of all these policies.
+
     Each arm is compiled once for each stage of its method. The seeds of all arms run side by side on the cores.
 
     Attributes:
@@ -51,7 +53,7 @@ class Trainer:
         stage_scalars: Sequence[PPOScalars],
         knowledge: Knowledge,
         key: jax.Array,
-        num_seeds: int,
+        seeds: Sequence[int],
         chunk_size: int,
     ) -> None:
         """Prepare the trainer; nothing is compiled yet.
@@ -59,10 +61,10 @@ class Trainer:
         Args:
           learners: learner of each arm, named as in `ARM_KEY_PURPOSES`.
           stages: stages of training, in order.
-          stage_scalars: traced settings of PPO of each stage.
+          stage_scalars: traced settings of PPO of each stage, leaves [S].
           knowledge: layout priors and statistics from before training.
           key: typed PRNG key [] of all arms and seeds.
-          num_seeds: S, seeds of each arm.
+          seeds: the S seeds of each arm; policies with other settings may have the same seed.
           chunk_size: updates in one call of `train`.
         """
         self.learners = dict(learners)
@@ -70,7 +72,7 @@ class Trainer:
         self._stage_scalars = list(stage_scalars)
         self._knowledge = knowledge
         self._key = key
-        self._num_seeds = num_seeds
+        self._seeds = list(seeds)
         self._chunk_size = chunk_size
 
         # Functions of each arm in each stage, (arm, stage index); those that train are compiled when they are needed.
@@ -82,7 +84,7 @@ class Trainer:
             self._keep_functions[arm] = self._jit_update(learner.keep_if_best, (0, 0))
             for stage_index in range(len(self._stages)):
                 restart = self._stage_learner(arm, stage_index).restart_episodes
-                self._restart_functions[arm, stage_index] = self._jit_update(restart, (0, None, None))
+                self._restart_functions[arm, stage_index] = self._jit_update(restart, (0, None, None, 0))
         self._compiled: dict[tuple[str, int], Any] = {}
 
     def abstract_states(self, env_params: EnvParams) -> SeedStates:
@@ -103,9 +105,10 @@ class Trainer:
         for arm, init in self._init_functions.items():
             arm_key = jax.random.fold_in(self._key, ARM_KEY_PURPOSES[arm])
             seed_states[arm] = []
-            for seed in range(self._num_seeds):
+            for index, seed in enumerate(self._seeds):
                 seed_key = jax.random.fold_in(arm_key, seed)
-                seed_states[arm].append(init(seed_key, env_params, self._knowledge))
+                experience_prob = self._scalars_of_seed(0, index).experience_prob
+                seed_states[arm].append(init(seed_key, env_params, self._knowledge, experience_prob))
         return seed_states
 
     def restart(self, states: TrainerStates, env_params: EnvParams, stage_index: int = 0) -> TrainerStates:
@@ -113,7 +116,10 @@ class Trainer:
         new_states: TrainerStates = {}
         for arm, arm_states in states.items():
             restart = self._restart_functions[arm, stage_index]
-            new_states[arm] = [restart(state, env_params, self._knowledge) for state in arm_states]
+            new_states[arm] = []
+            for index, state in enumerate(arm_states):
+                experience_prob = self._scalars_of_seed(stage_index, index).experience_prob
+                new_states[arm].append(restart(state, env_params, self._knowledge, experience_prob))
         return new_states
 
     def keep_best(self, states: TrainerStates, scores: Mapping[str, Sequence[float]]) -> TrainerStates:
@@ -149,14 +155,13 @@ class Trainer:
             train_functions[arm] = self._compiled_train(arm, stage_index, states[arm][0], env_params)
 
         def train_seed(job: tuple[str, int]) -> Any:
-            arm, seed = job
-            result = train_functions[arm](
-                states[arm][seed], self._stage_scalars[stage_index], env_params, self._knowledge
-            )
+            arm, index = job
+            scalars = self._scalars_of_seed(stage_index, index)
+            result = train_functions[arm](states[arm][index], scalars, env_params, self._knowledge)
             return jax.block_until_ready(result)
 
         # Seeds of all arms run in threads, as many as there are cores.
-        jobs = [(arm, seed) for seed in range(self._num_seeds) for arm in self.learners]
+        jobs = [(arm, index) for index in range(len(self._seeds)) for arm in self.learners]
         with ThreadPoolExecutor(min(len(jobs), os.cpu_count() or 1)) as pool:
             results = list(pool.map(train_seed, jobs))
 
@@ -168,6 +173,10 @@ class Trainer:
             metrics[arm].append({name: float(value) for name, value in values.items()})
         return new_states, metrics
 
+    def _scalars_of_seed(self, stage_index: int, index: int) -> PPOScalars:
+        """Traced settings of a stage for the seed of this index."""
+        return jax.tree.map(operator.itemgetter(index), self._stage_scalars[stage_index])
+
     def _stage_learner(self, arm: str, stage_index: int) -> Learner:
         """Learner of an arm in a stage."""
         return dataclasses.replace(self.learners[arm], stage=self._stages[stage_index])
@@ -176,9 +185,13 @@ class Trainer:
         """Compiled chunk of updates of an arm in a stage, for arguments like these."""
         if (arm, stage_index) not in self._compiled:
             learner = self._stage_learner(arm, stage_index)
-            arguments = (state, self._stage_scalars[stage_index], env_params, self._knowledge)
+            arguments = (state, self._scalars_argument(stage_index), env_params, self._knowledge)
             self._compiled[arm, stage_index] = self._compile_train(learner, arguments)
         return self._compiled[arm, stage_index]
+
+    def _scalars_argument(self, stage_index: int) -> PPOScalars:
+        """Traced settings of a stage as the compiled function takes them."""
+        return self._scalars_of_seed(stage_index, 0)
 
     # How a learner's functions are compiled; a trainer on several devices does it differently.
 
@@ -219,10 +232,10 @@ class ShardedTrainer(Trainer):
             return jax.tree.map(lambda *leaves: jnp.stack(leaves), *arm_states)
 
         def unstack(stacked_state: LearnerState) -> list[LearnerState]:
-            return [jax.tree.map(operator.itemgetter(seed), stacked_state) for seed in range(self._num_seeds)]
+            return [jax.tree.map(operator.itemgetter(index), stacked_state) for index in range(len(self._seeds))]
 
         self._stack = jax.jit(stack, out_shardings=self._stacked_sharding)
-        self._unstack = jax.jit(unstack, out_shardings=[self._seed_sharding] * self._num_seeds)
+        self._unstack = jax.jit(unstack, out_shardings=[self._seed_sharding] * len(self._seeds))
 
     def abstract_states(self, env_params: EnvParams) -> SeedStates:
         """Shapes, dtypes and shardings of all states in a checkpoint."""
@@ -252,7 +265,8 @@ class ShardedTrainer(Trainer):
         new_states: TrainerStates = {}
         for arm, stacked_state in states.items():
             restart = self._restart_functions[arm, stage_index]
-            new_states[arm] = restart(stacked_state, env_params, self._knowledge)
+            experience_prob = self._stage_scalars[stage_index].experience_prob
+            new_states[arm] = restart(stacked_state, env_params, self._knowledge, experience_prob)
         return new_states
 
     def keep_best(self, states: TrainerStates, scores: Mapping[str, Sequence[float]]) -> TrainerStates:
@@ -276,7 +290,9 @@ class ShardedTrainer(Trainer):
 
             # Metrics come as one array [S] for each name.
             arm_metrics = {name: value.tolist() for name, value in jax.device_get(values).items()}
-            metrics[arm] = [{name: row[seed] for name, row in arm_metrics.items()} for seed in range(self._num_seeds)]
+            metrics[arm] = []
+            for index in range(len(self._seeds)):
+                metrics[arm].append({name: row[index] for name, row in arm_metrics.items()})
         return new_states, metrics
 
     def _replicate_env_params(self, env_params: EnvParams) -> EnvParams:
@@ -285,6 +301,9 @@ class ShardedTrainer(Trainer):
             self._local_env_params = env_params
             self._replicated_env_params = replicate_on_devices(self._mesh, env_params)
         return self._replicated_env_params
+
+    def _scalars_argument(self, stage_index: int) -> PPOScalars:
+        return self._stage_scalars[stage_index]
 
     def _jit_init(self, learner: Learner) -> Any:
         return jax.jit(learner.init, out_shardings=self._seed_sharding)
@@ -296,10 +315,10 @@ class ShardedTrainer(Trainer):
         replicated = replicated_sharding(self._mesh)
 
         def train(stacked_state: LearnerState, scalars: PPOScalars, env_params: EnvParams, knowledge: Knowledge) -> Any:
-            def train_seed(state: LearnerState) -> Any:
-                return learner.train(state, scalars, env_params, knowledge, self._chunk_size)
+            def train_seed(state: LearnerState, seed_scalars: PPOScalars) -> Any:
+                return learner.train(state, seed_scalars, env_params, knowledge, self._chunk_size)
 
-            new_state, metrics = jax.vmap(train_seed, spmd_axis_name=SEED_AXIS)(stacked_state)
+            new_state, metrics = jax.vmap(train_seed, spmd_axis_name=SEED_AXIS)(stacked_state, scalars)
 
             # Metrics are sent between devices as one array [S, names].
             table = jnp.stack(list(metrics.values()), axis=-1)

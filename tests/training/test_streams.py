@@ -151,10 +151,10 @@ def test_trainer_trains_the_direct_stream_alone_and_then_both():
     trainer = Trainer(
         {"layout": learner},
         config.stages,
-        scalars_by_stage(config),
+        [jax.tree.map(lambda leaf: leaf[None], scalars) for scalars in scalars_by_stage(config)],
         KNOWLEDGE,
         jax.random.key(0),
-        num_seeds=1,
+        seeds=[0],
         chunk_size=2,
     )
 
