@@ -480,30 +480,35 @@ class ExperienceLead(NamedTuple):
     remaining: Interval | None
 
 
-def remaining_share(layout_blind: np.ndarray, agent: np.ndarray, removed: np.ndarray, scenes: Clusters) -> Interval:
+def remaining_share(
+    layout_blind: np.ndarray, agent: np.ndarray, removed: np.ndarray, scenes: Clusters, *, same_runs: bool = False
+) -> Interval:
     """Compute the share of an agent's lead that remains after removal.
 
     The share is (removed - layout_blind) / (agent - layout_blind), of means over the same episodes.
 
     Args:
       layout_blind: bool, int or float [S, E], results of the layout-blind agent.
-      agent: [S, E], results of the agent with experience, trained separately.
+      agent: [S, E], results of the agent with experience.
       removed: [S, E], results of the policies of `agent`, with removal.
       scenes: clusters of the E episodes.
+      same_runs: whether both agents are the same S training runs, or were trained separately.
 
     Returns:
       The share in percent, with its interval; NaN if the interval of the lead contains 0 or has no bounds.
     """
     # A share of a lead that may be 0 is meaningless.
-    lead = paired_difference(layout_blind, agent, scenes)
+    lead = paired_difference(layout_blind, agent, scenes, same_runs=same_runs)
     if not lead.has_bounds or lead.low <= 0.0 <= lead.high:
         return Interval(float("nan"))
 
-    # Replicates leave out one run of either agent, and one scene; numerator and denominator leave out the same.
-    runs = run_clusters(2, len(agent))
+    # Replicates leave out one run (of either agent, if they were trained separately), and one scene; numerator and
+    # denominator leave out the same.
+    runs = run_clusters(1 if same_runs else 2, len(agent))
 
     def lead_replicates(results: np.ndarray) -> np.ndarray:
-        signed_results = np.concatenate([-np.asarray(layout_blind, np.float64), np.asarray(results, np.float64)])
+        both_results = -np.asarray(layout_blind, np.float64), np.asarray(results, np.float64)
+        signed_results = sum(both_results) if same_runs else np.concatenate(both_results)
         return runs.weights.T @ signed_results @ scenes.weights
 
     return jackknife_interval(100.0 * lead_replicates(removed) / lead_replicates(agent), scenes, runs)

@@ -11,6 +11,7 @@ outcomes, at each shift and over the mixture.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple, TypeVar
 
@@ -121,7 +122,8 @@ def measure_mixture(
       rules: rules of soft removal, in addition to TDE and removals that follow no gap.
 
     Raises:
-      InputError: there are no layout-blind agents, or they differ in world, goals or number of seeds.
+      InputError: there are no layout-blind agents, or they differ in world, goals or number of seeds. Runs whose scores
+        are a sum need none: they are compared with their own complete removal.
     """
     return _measure_removals(bench, run, decoding, rules, "own")
 
@@ -193,10 +195,9 @@ def _measure_removals(
 
     # Values of the agents themselves.
     metrics = PopulationMetrics(episodes, shift_index, budgets)
-    layout_blind_agent = require_layout_blind_run(bench, run.fold_runs[0]).agent
     run_names = {
         "own": run.agent,
-        "layout-blind": f"{run.agent}, handed over to {layout_blind_agent}",
+        "layout-blind": f"{run.agent}, handed over to {bench.config.reference_agent}",
         "without experience": f"{run.agent}, without experience",
     }
     report = _RemovalReport(
@@ -205,6 +206,7 @@ def _measure_removals(
         metrics=metrics,
         layout_blind=metrics.percent_metrics(outcomes.layout_blind),
         agent=metrics.percent_metrics(outcomes.plain),
+        same_runs=remaining == "own" and run.config.has_additive_scores,
         num_scenes=len(episodes.scenes) // len(shifts),
     )
     yield from report.agent_rows()
@@ -244,10 +246,13 @@ def _run_removals(
     remaining: RemainingDecision,
 ) -> RemovalOutcomes:
     """Run the removals of a run and their controls in a mixed population; see `_measure_removals`."""
-    # Paired comparisons need the same episodes and as many training runs on both sides.
-    layout_blind_run = require_layout_blind_run(bench, run)
+    # Where scores are a sum, complete removal leaves an agent without any experience, and no other agent is needed.
+    # Else the layout-blind agents meet the same episodes, in as many training runs.
+    layout_blind_run = None
+    if not (remaining == "own" and run.config.has_additive_scores):
+        layout_blind_run = require_layout_blind_run(bench, run)
+        bench.train(layout_blind_run)
     bench.train(run)
-    bench.train(layout_blind_run)
     world, episodes, _ = population
     removals = bench.config.removals
     runner = TrialRunner(bench.config.seed)
@@ -265,11 +270,13 @@ def _run_removals(
         outcomes = bench.recall_outcomes(f"{run.name}: {name}", measure)
         return dict(zip(distinct_trials, outcomes, strict=True))
 
-    # Both runs meet the same episodes.
-    layout_blind = EvaluatedRun(load_policies(layout_blind_run.config, ("baseline",)), world, episodes)
+    layout_blind = None
+    if layout_blind_run is not None:
+        layout_blind = EvaluatedRun(load_policies(layout_blind_run.config, ("baseline",)), world, episodes)
     policies = load_policies(run.config, ("layout",))
     match remaining:
         case "layout-blind":
+            assert layout_blind is not None
             policies = policies.with_handover_to(layout_blind.policies)
         case "without experience":
             policies = policies.with_own_fallback()
@@ -277,13 +284,15 @@ def _run_removals(
     estimator = require_estimator_config(policies)
 
     # References and removals that follow no gap are evaluated once, for all rules.
-    baseline_trial = Trial("baseline", decoding)
-    layout_blind_outcome = run_trials("layout-blind", layout_blind, None, [baseline_trial])[baseline_trial]
     bench.console.print("complete removal and removals that follow no gap")
     fixed_trials = select_removals(list_fixed_trials(decoding, WORLDS[run.config.world].budgets[-1]), removals)
     plain_trial = Trial("layout", decoding)
     hard_trial = Trial("tde", decoding)
     outcomes = run_trials("plain", evaluated_run, estimator, [plain_trial, hard_trial, *fixed_trials.values()])
+    layout_blind_outcome = outcomes[hard_trial]
+    if layout_blind is not None:
+        baseline_trial = Trial("baseline", decoding)
+        layout_blind_outcome = run_trials("layout-blind", layout_blind, None, [baseline_trial])[baseline_trial]
 
     hard_controls = {}
     if remaining == "own":
@@ -493,10 +502,11 @@ class PopulationMetrics:
         return self._for_each_shift(difference, reference, compared)
 
     def remaining_shares(
-        self, layout_blind: MetricValues, agent: MetricValues, removed: MetricValues
+        self, layout_blind: MetricValues, agent: MetricValues, removed: MetricValues, *, same_runs: bool
     ) -> dict[str, tuple[Interval, ...]]:
         """Compute the share of the lead that remains after removal, for each metric at each shift."""
-        return self._for_each_shift(remaining_share, layout_blind, agent, removed)
+        statistic = functools.partial(remaining_share, same_runs=same_runs)
+        return self._for_each_shift(statistic, layout_blind, agent, removed)
 
     def overall_differences(self, reference: MetricValues, compared: MetricValues) -> dict[str, Interval]:
         """Compute `compared - reference` of the same policies over all episodes, for each metric."""
@@ -529,6 +539,7 @@ class _RemovalReport(NamedTuple):
       metrics: computes and compares metrics.
       layout_blind: results of the layout-blind agent.
       agent: results of the agent with experience, without removal.
+      same_runs: True if both agents are the same training runs.
       num_scenes: number of scenes at each shift.
     """
 
@@ -537,6 +548,7 @@ class _RemovalReport(NamedTuple):
     metrics: PopulationMetrics
     layout_blind: MetricValues
     agent: MetricValues
+    same_runs: bool
     num_scenes: int
 
     def row(self, metric: str, value: Interval, **fields: Any) -> ResultRow:
@@ -545,7 +557,7 @@ class _RemovalReport(NamedTuple):
 
     def agent_rows(self) -> Iterator[ResultRow]:
         """Make the rows of both agents without removal, and of the lead of one over the other."""
-        lead = self.metrics.differences(self.layout_blind, self.agent, same_runs=False)
+        lead = self.metrics.differences(self.layout_blind, self.agent, same_runs=self.same_runs)
         yield from self._shift_rows(self.metrics.means(self.layout_blind), variant=LAYOUT_BLIND)
         yield from self._shift_rows(self.metrics.means(self.agent), variant=WITHOUT_REMOVAL)
         yield from self._shift_rows(lead, variant=WITHOUT_REMOVAL, reference=LAYOUT_BLIND)
@@ -570,7 +582,7 @@ class _RemovalReport(NamedTuple):
             yield self.row(metric, difference, **fields)
 
         # The share of the lead that remains, of a value or a cost.
-        shares = metrics.remaining_shares(self.layout_blind, self.agent, removed)
+        shares = metrics.remaining_shares(self.layout_blind, self.agent, removed, same_runs=self.same_runs)
         share_rows = {f"{metric} remaining": by_shift for metric, by_shift in shares.items()}
         yield from self._shift_rows(share_rows, variant=name)
 

@@ -32,6 +32,20 @@ def test_remaining_share_of_a_fixed_share_is_exact(share):
     np.testing.assert_allclose((interval.mean, interval.low, interval.high), 100 * share, atol=1e-9)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.25, 1.5])
+def test_remaining_share_of_the_same_runs_leaves_out_both_at_once(share):
+    generator = np.random.default_rng(3)
+    agent = draw_results(generator, 0.9)
+    without = agent - 0.3 - draw_results(generator, 0.0)  # a lead of its own in every run
+    removed = without + share * (agent - without)
+    interval = remaining_share(without, agent, removed, CLUSTERS, same_runs=True)
+    # Each run keeps the same share of its own lead, whichever run is left out.
+    np.testing.assert_allclose((interval.mean, interval.low, interval.high), 100 * share, atol=1e-9)
+    # As separate runs, numerator and denominator would leave out runs with different leads.
+    separate = remaining_share(without, agent, removed, CLUSTERS)
+    assert separate.high - separate.low > 1.0
+
+
 def test_remaining_share_interval_covers_the_true_share():
     generator, num_covered = np.random.default_rng(1), 0
     for _ in range(200):
