@@ -37,9 +37,9 @@ class EpisodeConfig:
         successes are printed.
       shift_by: categories that exchange their places under a shift. `size`: neighbours in size, drawn for each scene.
         `context`: the ones whose exchange misleads most, fitted to the training scenes and equal in all scenes.
-      map: draw the map that the agent made, the block that it searches and its way to it. This needs a method that
-        searches with a map, and writes a PNG.
-      step: step at which the map is drawn, from 1. The default is the last step.
+      map: draw the map that the agent made, the block that it searches and its way to it, with a row for each
+        `--shift`. This needs a method that searches with a map, and writes a PNG.
+      step: step at which the map is drawn, from 1. Shorter episodes show their end. The default is the last step.
     """
 
     source: str
@@ -80,8 +80,6 @@ def _draw(config: EpisodeConfig, console: Console) -> None:
         raise InputError(f"--variant {' '.join(config.variant)}: give one or more different variants")
     if len(set(config.shift)) < len(config.shift):
         raise InputError(f"--shift {' '.join(map(str, config.shift))}: give different shifts")
-    if config.map and len(config.shift) > 1:
-        raise InputError("--map: the map is drawn at one layout shift; give one --shift")
     if config.map and len(config.variant) > 1:
         raise InputError("--map: the map is drawn of one variant; give one --variant")
 
@@ -101,8 +99,11 @@ def _draw(config: EpisodeConfig, console: Console) -> None:
     if config.map:
         # Steps are counted from 1 in the option, from 0 in the trace.
         step = (num_steps if config.step is None else config.step) - 1
+        if not 0 <= step < num_steps:
+            raise InputError(f"--step {step + 1}: give a number from 1 to {num_steps}")
         with console.status("drawing the map"):
-            draw_search(episodes[0], take_snapshot(episodes[0], step), step, path)
+            snapshots = [take_snapshot(episode, min(step, len(episode.trace.pose) - 1)) for episode in episodes]
+            draw_search(episodes, snapshots, step, path)
     else:
         with console.status("drawing the episode"):
             draw_episode(episodes, path)

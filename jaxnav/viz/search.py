@@ -1,11 +1,11 @@
 """Picture of a search with a map: the agent's map at one step, its target block and its planned path.
 
 `take_snapshot` recomputes the map and the plan of a step from a played episode, and `draw_search` draws both over the
-plan of the home. `MapProjection` converts cells of the toroidal map to places in the world. For a search by belief, the
+plan of the home, with a row for each episode, such as those with and without a layout shift. `MapProjection` converts cells of the toroidal map to places in the world. For a search by belief, the
 picture has two panels with the belief as a heat map: with all experience, and after its removal.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -255,24 +255,49 @@ class MapProjection:
 
 
 @default_style
-def draw_search(episode: PlayedEpisode, snapshot: SearchSnapshot, step: int, path: Path) -> None:
-    """Write the picture of the search at a step as a PNG."""
-    figure = Figure(figsize=(9.6, 5.4), dpi=100)
-    FigureCanvasAgg(figure)
-    projection = MapProjection(episode, snapshot)
+def draw_search(episodes: Sequence[PlayedEpisode], snapshots: Sequence[SearchSnapshot], step: int, path: Path) -> None:
+    """Write the picture of the search at a step as a PNG, with a row for each episode.
 
-    # Texts above the plan.
+    Args:
+      episodes: one or more episodes with the same goal.
+      snapshots: the snapshot of each.
+      step: step of the snapshots, from 0; episodes that ended earlier show their end.
+      path: file to write.
+    """
+    num_rows = len(episodes)
+    figure = Figure(figsize=(9.6, 5.4 * num_rows), dpi=100)
+    FigureCanvasAgg(figure)
+    for row, (episode, snapshot) in enumerate(zip(episodes, snapshots, strict=True)):
+        bottom = 1.0 - (row + 1) / num_rows
+        _draw_row(figure, bottom, 1.0 / num_rows, episode, snapshot, min(step, len(episode.trace.pose) - 1))
+
+    # The legend stands to the right of the plans.
+    goal_name = episodes[0].task.categories[episodes[0].goal]
+    legend_handles = _legend_handles(goal_name, any(snapshot.is_searching for snapshot in snapshots))
+    if snapshots[0].beliefs:
+        legend_handles.append(Patch(color=BELIEF_COLOR, alpha=_MAX_OPACITY, label=f"{goal_name} is likely here"))
+    figure.legend(handles=legend_handles, loc="center left", bbox_to_anchor=(0.73, 0.5), fontsize=9, frameon=False)
+    save_figure(figure, path)
+
+
+def _draw_row(
+    figure: Figure, bottom: float, height: float, episode: PlayedEpisode, snapshot: SearchSnapshot, step: int
+) -> None:
+    """Draw the panels of one episode in a part of the figure, with texts above them."""
+    projection = MapProjection(episode, snapshot)
     goal_name = episode.task.categories[episode.goal]
     status_text, status_color = describe_step(episode, step)
-    figure.text(0.02, 0.945, episode.title, color=MUTED_COLOR, fontsize=9.5)
-    figure.text(0.02, 0.9, f"Looking for {goal_name}", color=GOAL_COLOR, fontsize=14, weight="bold")
-    figure.text(0.98, 0.935, status_text, color=status_color, fontsize=10.5, ha="right")
+    figure.text(0.02, bottom + 0.945 * height, episode.title, color=MUTED_COLOR, fontsize=9.5)
+    search_text = f"Looking for {goal_name}"
+    figure.text(0.02, bottom + 0.9 * height, search_text, color=GOAL_COLOR, fontsize=14, weight="bold")
+    figure.text(0.98, bottom + 0.935 * height, status_text, color=status_color, fontsize=10.5, ha="right")
 
     # A panel for each belief; one panel without a belief.
     panel_titles = list(snapshot.beliefs) or [""]
     panel_width = 0.7 / len(panel_titles)
+    panel_height = (0.82 if snapshot.beliefs else 0.85) * height
     for index, panel_title in enumerate(panel_titles):
-        axes = figure.add_axes((0.015 + index * panel_width, 0.03, panel_width, 0.82 if panel_title else 0.85))
+        axes = figure.add_axes((0.015 + index * panel_width, bottom + 0.03 * height, panel_width, panel_height))
         axes.set_title(panel_title, fontsize=9.5, color=MUTED_COLOR)
         # The plan of the home, faint, under the agent's map.
         draw_plan_background(axes, episode.scene)
@@ -281,13 +306,6 @@ def draw_search(episode: PlayedEpisode, snapshot: SearchSnapshot, step: int, pat
             _draw_belief(axes, snapshot.beliefs[panel_title], projection)
         _draw_paths(axes, episode, snapshot, step, projection)
         _draw_marks(axes, episode, snapshot, projection)
-
-    # The legend stands to the right of the plan.
-    legend_handles = _legend_handles(goal_name, snapshot.is_searching)
-    if snapshot.beliefs:
-        legend_handles.append(Patch(color=BELIEF_COLOR, alpha=_MAX_OPACITY, label=f"{goal_name} is likely here"))
-    figure.legend(handles=legend_handles, loc="center left", bbox_to_anchor=(0.73, 0.5), fontsize=9, frameon=False)
-    save_figure(figure, path)
 
 
 def _draw_map(axes: Axes, snapshot: SearchSnapshot, projection: MapProjection) -> None:

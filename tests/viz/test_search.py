@@ -169,7 +169,7 @@ def test_draw_search_shows_the_goal_or_else_the_chosen_block(corridor_walk, tmp_
     num_pixels = {}
     for name, (snapshot, step) in pictures.items():
         path = tmp_path / "new" / f"{name}.png"
-        draw_search(episode, snapshot, step, path)
+        draw_search([episode], [snapshot], step, path)
         num_pixels[name] = count_pixels(path)
 
     assert num_pixels["last"]["near"] > num_pixels["first"]["near"] > 0
@@ -224,6 +224,16 @@ def test_heat_maps_show_the_belief_before_and_after_removal(corridor_walk, tmp_p
     # Both are drawn.
     positions = np.repeat(np.asarray(search_state.position)[None], 3, axis=0)
     snapshot = SearchSnapshot(jax.tree.map(np.asarray, search_state), positions, 2, beliefs)
-    draw_search(episode, snapshot, 3, tmp_path / "belief.png")
+    draw_search([episode], [snapshot], 3, tmp_path / "belief.png")
     with Image.open(tmp_path / "belief.png") as image:
         assert image.size == (960, 540)
+
+    # Two episodes make two rows; one that is shorter shows its end.
+    longer_step = NUM_STEPS + 5
+    draw_search([episode, episode], [snapshot, snapshot], longer_step, tmp_path / "two.png")
+    draw_search([episode], [snapshot], NUM_STEPS - 1, tmp_path / "end.png")
+    with Image.open(tmp_path / "two.png") as image, Image.open(tmp_path / "end.png") as end_image:
+        assert image.size == (960, 1080)
+        two_pixels, end_pixels = (np.asarray(picture.convert("RGB"))[:, :650] for picture in (image, end_image))
+        np.testing.assert_array_equal(two_pixels[:540], end_pixels)
+        np.testing.assert_array_equal(two_pixels[540:], end_pixels)
