@@ -6,7 +6,7 @@ which takes a few shifts per step, and `follow_path` returns the agent's next ac
 from one cell to all.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,14 +17,18 @@ from jaxnav.scenes.task import MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT
 WORD_BITS = 32
 _LAST_BIT = np.uint32(WORD_BITS - 1)
 
-#: Binary digits in which `walking_steps` counts, and the largest number of steps that they hold.
-_NUM_STEP_DIGITS = 8
-MAX_STEPS = 2**_NUM_STEP_DIGITS - 1
+#: Steps between two updates of the numbers that `walking_steps` counts.
+STEPS_PER_COUNT = 8
+_NUM_STEP_DIGITS = 3
+#: Binary digits in which it counts updates, and the largest number of steps that all digits hold.
+_NUM_COUNT_DIGITS = 5
+MAX_STEPS = STEPS_PER_COUNT * 2**_NUM_COUNT_DIGITS
 
 #: State of the wave: number of steps, cells reached one step before, and cells reached so far.
 _Wave = tuple[jax.Array, jax.Array, jax.Array]
-#: The same with the digits of the distances so far.
-_CountingWave = tuple[jax.Array, jax.Array, jax.Array, tuple[jax.Array, ...]]
+#: State of a wave that is counted: number of updates, cells reached at the last update but one and at the last one,
+#: and digits of the updates that each cell waited for, and of its step after them.
+_CountingWave = tuple[jax.Array, jax.Array, jax.Array, tuple[jax.Array, ...], tuple[jax.Array, ...]]
 
 
 class PathField(NamedTuple):
@@ -39,16 +43,23 @@ class PathField(NamedTuple):
     closer_cells: jax.Array
 
 
+@jax.custom_batching.custom_vmap
 def find_path(targets: jax.Array, passable: jax.Array, start: jax.Array) -> PathField:
     """Find a shortest path to the nearest target.
 
-    A step leads to one of the eight neighbours. The start and the targets need not be passable.
+    A step leads to one of the eight neighbours. The start and the targets need not be passable. Under `vmap` on a CPU,
+    one wave follows the other, so that each ends where its own path is found; elsewhere they spread side by side.
 
     Args:
       targets: uint32 [N, N / 32].
       passable: uint32 [N, N / 32].
       start: int32 [2], (z, x).
     """
+    return _find_path(targets, passable, start)
+
+
+def _find_path(targets: jax.Array, passable: jax.Array, start: jax.Array) -> PathField:
+    """Find a shortest path; see `find_path`."""
     # The wave runs backwards, from the targets to the start, and must be able to enter the start.
     start_row, start_column = start
     start_bit = jnp.uint32(1) << (start_column % WORD_BITS).astype(jnp.uint32)
@@ -70,6 +81,22 @@ def find_path(targets: jax.Array, passable: jax.Array, start: jax.Array) -> Path
     return PathField(jnp.where(is_on_board(reached, start), length, -1), reached_before)
 
 
+@find_path.def_vmap
+def _find_paths(
+    num_paths: int, is_batched: list[bool], targets: jax.Array, passable: jax.Array, start: jax.Array
+) -> tuple[PathField, Any]:
+    """Find the paths of several maps, leaves [B, ...], and say that all leaves have that axis; see `find_path`."""
+    arguments = []
+    for argument, has_batch_axis in zip((targets, passable, start), is_batched, strict=True):
+        arguments.append(argument if has_batch_axis else jnp.broadcast_to(argument, (num_paths, *argument.shape)))
+
+    def one_by_one(*arguments: jax.Array) -> PathField:
+        return jax.lax.map(lambda row: _find_path(*row), arguments)
+
+    paths = jax.lax.platform_dependent(*arguments, cpu=one_by_one, default=jax.vmap(_find_path))
+    return paths, jax.tree.map(lambda _: True, paths)
+
+
 def walking_steps(passable: jax.Array, start: jax.Array) -> jax.Array:
     """Number of steps from a cell to every cell, int32 [N, N]; -1 where there is no path of at most `MAX_STEPS` steps.
 
@@ -84,29 +111,47 @@ def walking_steps(passable: jax.Array, start: jax.Array) -> jax.Array:
     reached = jnp.zeros_like(passable).at[start_row, start_column // WORD_BITS].set(start_bit)
     enterable = passable | reached
 
-    # A cell is at a distance of as many steps as the wave has made without reaching it. The numbers of all cells are
-    # counted together: digit i of a cell's number is its bit on board i.
-    digits = (jnp.zeros_like(passable),) * _NUM_STEP_DIGITS
+    # The distance of a cell is the number of steps that do not reach it, plus 1. Whole updates without the cell are
+    # counted for all cells together: digit i of a cell's number is its bit on board i. The step after them is stored at
+    # the update that first has the cell.
+    no_bits = jnp.zeros_like(passable)
+    no_digits = (no_bits,) * _NUM_COUNT_DIGITS, (no_bits,) * _NUM_STEP_DIGITS
 
     def is_spreading(wave: _CountingWave) -> jax.Array:
-        step, reached_before, reached, _ = wave
-        return (step < MAX_STEPS) & ((step == 0) | (reached != reached_before).any())
+        num_counts, reached_before, reached, _, _ = wave
+        return (num_counts < MAX_STEPS // STEPS_PER_COUNT) & ((num_counts == 0) | (reached != reached_before).any())
 
-    def spread(wave: _CountingWave) -> _CountingWave:
-        step, _, reached, digits = wave
-        carry = ~reached
-        next_digits = []
-        for digit in digits:
-            next_digits.append(digit ^ carry)
+    def spread(reached: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:
+        next_reached = reached | (dilate_board(reached) & enterable)
+        return next_reached, next_reached & ~reached
+
+    def spread_and_count(wave: _CountingWave) -> _CountingWave:
+        num_counts, _, reached, count_digits, step_digits = wave
+        next_reached, new_cells = jax.lax.scan(spread, reached, None, length=STEPS_PER_COUNT)
+
+        # Add 1 to the numbers of the cells that are still missing.
+        carry = ~next_reached
+        next_count_digits = []
+        for digit in count_digits:
+            next_count_digits.append(digit ^ carry)
             carry = digit & carry
-        return step + 1, reached, reached | (dilate_board(reached) & enterable), tuple(next_digits)
 
-    _, _, reached, digits = jax.lax.while_loop(is_spreading, spread, (jnp.int32(0), reached, reached, digits))
+        # Store steps 0 to 7 of the new cells.
+        next_step_digits = list(step_digits)
+        for step in range(STEPS_PER_COUNT):
+            for index in range(_NUM_STEP_DIGITS):
+                if step >> index & 1:
+                    next_step_digits[index] |= new_cells[step]
+        return num_counts + 1, reached, next_reached, tuple(next_count_digits), tuple(next_step_digits)
+
+    start_wave = (jnp.int32(0), reached, reached, *no_digits)
+    _, _, reached, count_digits, step_digits = jax.lax.while_loop(is_spreading, spread_and_count, start_wave)
 
     # Read the numbers of all cells from the boards.
-    steps = jnp.zeros((passable.shape[0], passable.shape[0]), jnp.int32)
-    for index, digit in enumerate(digits):
+    steps = jnp.ones((passable.shape[0], passable.shape[0]), jnp.int32)
+    for index, digit in enumerate((*step_digits, *count_digits)):
         steps += unpack_board(digit).astype(jnp.int32) << index
+    steps = steps.at[start_row, start_column].set(0)
     return jnp.where(unpack_board(reached), steps, -1)
 
 

@@ -1,8 +1,9 @@
 """Picture of a search with a map: the agent's map at one step, its target block and its planned path.
 
 `take_snapshot` recomputes the map and the plan of a step from a played episode, and `draw_search` draws both over the
-plan of the home, with a row for each episode, such as those with and without a layout shift. `MapProjection` converts cells of the toroidal map to places in the world. For a search by belief, the
-picture has two panels with the belief as a heat map: with all experience, and after its removal.
+plan of the home, with a row for each episode, such as those with and without a layout shift. `MapProjection` converts
+cells of the toroidal map to places in the world. For a search by belief, each row has two panels with the belief as a
+heat map: with all experience, and after its removal.
 """
 
 from collections.abc import Mapping, Sequence
