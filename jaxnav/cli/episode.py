@@ -9,6 +9,7 @@ from rich.console import Console
 from jaxnav.choices import EstimatorName, PlayedVariant, ShiftKind
 from jaxnav.cli.console import parse_arguments, run_command
 from jaxnav.errors import InputError
+from jaxnav.progress import show_activity
 from jaxnav.store.files import expand_home
 
 DESCRIPTION = "Draw one evaluation episode as a GIF or a PNG."
@@ -101,11 +102,11 @@ def _draw(config: EpisodeConfig, console: Console) -> None:
         step = (num_steps if config.step is None else config.step) - 1
         if not 0 <= step < num_steps:
             raise InputError(f"--step {step + 1}: give a number from 1 to {num_steps}")
-        with console.status("drawing the map"):
+        with show_activity(console, "drawing the map"):
             snapshots = [take_snapshot(episode, min(step, len(episode.trace.pose) - 1)) for episode in episodes]
             draw_search(episodes, snapshots, step, path)
     else:
-        with console.status("drawing the episode"):
+        with show_activity(console, "drawing the episode"):
             draw_episode(episodes, path)
     console.print(f"{num_steps} steps; written to {path}")
 

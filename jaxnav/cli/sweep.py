@@ -22,6 +22,7 @@ from jaxnav.cli.console import (
     write_latest,
 )
 from jaxnav.errors import InputError
+from jaxnav.progress import show_activity
 from jaxnav.store.files import expand_home
 
 if TYPE_CHECKING:
@@ -205,6 +206,6 @@ def _draw_figure(results: "list[Sweep]", path: Path, console: Console) -> None:
     from jaxnav.viz.style import save_figure
     from jaxnav.viz.sweep import sweep_figure
 
-    with console.status("drawing the figure"):
+    with show_activity(console, "drawing the figure"):
         save_figure(sweep_figure(results), path)
     console.print(f"figure: {path}")

@@ -15,6 +15,7 @@ from jaxnav.experiments.figures import gap_figure, similarity_figure
 from jaxnav.experiments.gap_traces import BELIEFS, mean_by_step, truncate_to_shortest
 from jaxnav.experiments.table import Curve
 from jaxnav.policies.methods import method_label
+from jaxnav.progress import show_activity
 from jaxnav.report.charts import differences_chart, leads_chart, thresholds_chart, to_svg
 from jaxnav.report.config import ReportConfig
 from jaxnav.report.measure import ShiftMeasurements, measure_shift
@@ -85,7 +86,7 @@ def make_report(run: Run, reference_run: Run | None, config: ReportConfig, conso
     # The sections compare the shifts; the replays, one player for each shift, follow the first section.
     page_title = f"{method_label(run.config.method)} in {first_row['world']}"
     replays_by_shift = [measurements.replays for measurements in by_shift.values()]
-    with console.status("drawing the page"):
+    with show_activity(console, "drawing the page"):
         sections = make_sections(run, by_shift, config.threshold)
         return render_page(page_title, run_facts, sections, replays_by_shift)
 

@@ -11,6 +11,7 @@ from jaxnav.evaluation.report import ExperienceLead, row_label
 from jaxnav.evaluation.similarity import cooccurrence_counts
 from jaxnav.experiments.gap_traces import GapTraces, trace_gaps
 from jaxnav.experiments.similarity import SuccessBySimilarity, compute_similarity_points, relate_success_to_similarity
+from jaxnav.progress import show_activity
 from jaxnav.report.config import ReportConfig
 from jaxnav.report.replays import ReplayAgent, Replays, make_replays
 from jaxnav.runs.evaluate import Results, evaluate, measure_leads
@@ -66,7 +67,7 @@ def measure_shift(
     account = None
     if reference_run is not None:
         quiet_console = Console(quiet=True)
-        with console.status(f"evaluating the reference run at shift {shift:g}"):
+        with show_activity(console, f"evaluating the reference run at shift {shift:g}"):
             reference_world = compile_evaluation_world(
                 reference_run.config, config.split, None, shift, quiet_console, shift_by=config.shift_by
             )
@@ -85,7 +86,7 @@ def measure_shift(
     similarity = _measure_similarity(results, policies, world) if has_one_bank else None
     gap_traces = None
     if has_one_bank and policies.estimator_config is not None:
-        with console.status(f"measuring the layout gap at shift {shift:g}"):
+        with show_activity(console, f"measuring the layout gap at shift {shift:g}"):
             gap_traces = trace_gaps(
                 policies.arm_params("layout"),
                 episodes,
@@ -100,7 +101,7 @@ def measure_shift(
 
     # The number of replays is that of the whole page.
     replays_per_shift = config.replays // len(set(config.shift))
-    with console.status(f"playing episodes for the replays at shift {shift:g}"):
+    with show_activity(console, f"playing episodes for the replays at shift {shift:g}"):
         replays = make_replays(agents, episodes, replays_per_shift, shift, config.split)
     return ShiftMeasurements(results, account, similarity, gap_traces, replays)
 

@@ -43,6 +43,7 @@ from jaxnav.evaluation.variants import (
     table_rows,
 )
 from jaxnav.policies.methods import find_method, method_label
+from jaxnav.progress import show_activity
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.evaluate_agents import evaluate_agents
 from jaxnav.runs.policies import (
@@ -187,7 +188,7 @@ def evaluate(
     # Run all rows, and the oracle on the same episodes. The oracle reads the tables of every bank once more.
     compiled = compiled or compile_evaluation_world(config, split, scenes, shift, console, world, shift_by)
     applied_shift = evaluation_shift(config, scenes or world, shift)
-    with console.status(_describe_evaluation(episodes, applied_shift)), ThreadPoolExecutor(1) as thread:
+    with show_activity(console, _describe_evaluation(episodes, applied_shift)), ThreadPoolExecutor(1) as thread:
         # Decision shares are counted in a thread: compilations use one core each.
         episode_lists = draw_episode_lists(compiled, episodes, seed)
         share_rows = rows_with_shares(rows)
@@ -209,7 +210,7 @@ def evaluate(
     rows = [*rows, table_row("oracle", None, None, "argmax")]
     outcome = _append_row(outcome, oracle_outcome)
     if any(row.uses_own_fallback for row in all_rows):
-        with console.status("evaluating removals that leave the policy without experience"):
+        with show_activity(console, "evaluating removals that leave the policy without experience"):
             rows, outcome, num_compilations = _add_fallback_rows(
                 all_rows, rows, outcome, policies, compiled, episodes, seed
             )
@@ -600,7 +601,7 @@ def sweep_shifts(
         # The agent loop depends on the task and the policy alone, so one evaluator serves all shifts.
         evaluator = evaluator or Evaluator(policies.make_agent_loop(compiled), has_controls=False)
         earlier_compilations = evaluator.compilations
-        with console.status(_describe_evaluation(episodes, applied_shift)):
+        with show_activity(console, _describe_evaluation(episodes, applied_shift)):
             episode_lists, outcome, compilations = evaluate_rows(rows, policies, compiled, episodes, seed, evaluator)
 
         episode_list = join_episode_lists(episode_lists)

@@ -18,6 +18,7 @@ from jaxnav.evaluation.grid import EpisodeOutcome
 from jaxnav.evaluation.notes import missing_interval_notes
 from jaxnav.evaluation.report import build_difference, build_report
 from jaxnav.evaluation.variants import EvaluationRow
+from jaxnav.progress import show_activity
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.results import Results, build_result_rows
 from jaxnav.runs.subjects import AgentSubject
@@ -52,7 +53,7 @@ def evaluate_agents(
     start_time = time.perf_counter()
     outcomes = []
     for index, agent in enumerate(subject.agents):
-        with console.status(f"evaluating {subject.name} in {num_episodes:,} episodes"):
+        with show_activity(console, f"evaluating {subject.name} in {num_episodes:,} episodes"):
             banks = zip(episode_lists, prefetch_env_params(compiled, range(len(compiled.banks))), strict=True)
             outcomes.append(run_agent(agent, subject.name, compiled.env, banks, jax.random.fold_in(key, index)))
     agent_outcome = jax.tree.map(lambda *leaves: np.stack(leaves), *outcomes)  # [S, E]
@@ -62,7 +63,7 @@ def evaluate_agents(
 
     # The references act in the same episodes, once for all seeds.
     outcome_by_variant: dict[Variant, EpisodeOutcome] = {"agent": agent_outcome}
-    with console.status("evaluating Random, frontier search and the shortest path"):
+    with show_activity(console, "evaluating Random, frontier search and the shortest path"):
         outcome_by_variant |= _run_references(compiled, episode_lists, jax.random.fold_in(key, len(subject.agents)))
     rows = [EvaluationRow(variant, None, None, "own") for variant in outcome_by_variant]
     num_seeds = len(subject.agents)

@@ -38,6 +38,7 @@ from jaxnav.policies.method import Knowledge
 from jaxnav.policies.methods import METHODS, find_method
 from jaxnav.policies.network import Params
 from jaxnav.policies.testing import check_method
+from jaxnav.progress import show_activity
 from jaxnav.runs.config import RunConfig, check_config
 from jaxnav.runs.policies import POLICIES_DIR, export_policy
 from jaxnav.runs.preparation import (
@@ -213,7 +214,7 @@ def _train_in_run_dir(
         export = functools.partial(_export_policies, point, policies, estimator_config, knowledge, exploration)
         run_on_first_process(export)
         if validator is not None:
-            with console.status("measuring the exported policies"):
+            with show_activity(console, "measuring the exported policies"):
                 success_by_budget = validator.success_by_budget(policies)
             write_reach = functools.partial(write_json_with_digest, point.run_dir / REACH_FILE, success_by_budget)
             run_on_first_process(write_reach)
@@ -298,14 +299,14 @@ def prepare_training(
         console.print(f"{config.run_dir / PREPARATION_DIR}: is damaged, so it is learned again")
 
     # Learn the layout prior, the estimator, and then everything that builds on both.
-    with console.status("random walks for the layout prior"):
+    with show_activity(console, "random walks for the layout prior"):
         exploration = explore_world(config, world)
         num_steps = int(exploration.steps)
         num_poses = int(exploration.poses)
     console.print(f"layout prior from {num_steps:,} random steps, {num_poses:,} distinct poses")
-    with console.status("calibrating the layout estimator"):
+    with show_activity(console, "calibrating the layout estimator"):
         estimator_config = calibrate_estimator(config, world, exploration, console)
-    with console.status("learning statistics of the training scenes"):
+    with show_activity(console, "learning statistics of the training scenes"):
         knowledge = learn_knowledge(config, world, exploration, estimator_config)
 
     # Methods without training by PPO fit their policies here.
@@ -446,7 +447,7 @@ def fit_policies(
 
     fitted_params = []
     for seed in range(config.seeds):
-        with console.status(f"fitting policy {seed + 1} of {config.seeds} to searches"):
+        with show_activity(console, f"fitting policy {seed + 1} of {config.seeds} to searches"):
             seed_key = jax.random.fold_in(arm_key, seed)
             params = fit(agent_loop, world.banks[0], env_params, knowledge, seed_key, config.ppo.num_envs, num_steps)
             fitted_params.append(jax.block_until_ready(params))
@@ -482,7 +483,7 @@ def _finish_fitted_run(
         except MissingSplitError as error:
             console.print(f"no val scenes, so the policies are not measured ({error})")
         else:
-            with console.status("measuring the policies"):
+            with show_activity(console, "measuring the policies"):
                 success_by_budget = validator.success_by_budget(policies)
             run_on_first_process(lambda: write_json_with_digest(config.run_dir / REACH_FILE, success_by_budget))
     console.print(f"{config.run_dir}: done in {stopwatch.read()['wall_s']:.0f} s")

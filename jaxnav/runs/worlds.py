@@ -20,6 +20,7 @@ from jaxnav.env.objectnav import EnvParams, ObjectNav
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
 from jaxnav.policies.method import Knowledge, Method
+from jaxnav.progress import show_activity
 from jaxnav.runs.config import RunConfig
 from jaxnav.scenes.categories import count_unknown_types, format_most_common
 from jaxnav.scenes.context_exchange import ContextExchange
@@ -212,7 +213,7 @@ def _compile_world(
 
     # Few scenes stay in memory as one bank.
     if len(scenes) <= config.worlds.shard_scenes:
-        with console.status(f"compiling {len(scenes):,} scenes"):
+        with show_activity(console, f"compiling {len(scenes):,} scenes"):
             bank = compile_bank((scenes[index] for index in range(len(scenes))), config.task)
         console.print(f"{len(bank.names)} scenes, {len(bank.rows):,} poses{_skipped_note(bank.skipped)}")
         return CompiledWorld(

@@ -30,6 +30,7 @@ from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
 from jaxnav.evaluation.playback import EpisodeTrace
 from jaxnav.evaluation.variants import EvaluationRow, table_row
 from jaxnav.policies.methods import method_label
+from jaxnav.progress import show_activity
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.evaluate import find_scene, replay_episodes
 from jaxnav.runs.policies import Policies, is_policy, load_policies, load_policy_as_run
@@ -185,7 +186,9 @@ def play_episode(
         row = _variant_row(policies, variant, epsilon)
         compared_episodes = shift_episodes.episodes.take(played_indices)
         plural = "" if len(played_indices) == 1 else "s"
-        with console.status(f"playing {len(played_indices):,} episode{plural} at shift {shift_episodes.shift:g}"):
+        with show_activity(
+            console, f"playing {len(played_indices):,} episode{plural} at shift {shift_episodes.shift:g}"
+        ):
             traces = replay_episodes(policies, shift_episodes.world, compared_episodes, row)
 
         suffix = f", {VARIANT_CAPTIONS[variant]}" if len(variants) > 1 else ""

@@ -1,0 +1,31 @@
+"""Progress of long activities on a console."""
+
+import contextlib
+import threading
+from collections.abc import Iterator
+
+from rich.console import Console
+
+#: Seconds after which an activity is worth a line in a file or pipe.
+_LINE_DELAY = 3.0
+
+
+@contextlib.contextmanager
+def show_activity(console: Console, text: str) -> Iterator[None]:
+    """Show what goes on: a spinner on a terminal, and elsewhere a line, if it takes more than three seconds.
+
+    Args:
+      console: console for progress; a quiet one shows nothing.
+      text: the activity, such as `compiling 20 scenes`.
+    """
+    if console.is_terminal:
+        with console.status(text):
+            yield
+        return
+    line_timer = threading.Timer(_LINE_DELAY, console.print, args=(f"{text} ...",))
+    line_timer.daemon = True
+    line_timer.start()
+    try:
+        yield
+    finally:
+        line_timer.cancel()
