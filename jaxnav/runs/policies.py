@@ -29,7 +29,7 @@ from jaxnav.policies.methods import find_method
 from jaxnav.policies.methods.org import ObjectRelations
 from jaxnav.policies.network import Params, bind, init_params
 from jaxnav.policies.spec import PolicySpec
-from jaxnav.runs.config import LayoutConfig, RunConfig
+from jaxnav.runs.config import LayoutConfig, RunConfig, WorldConfig
 from jaxnav.runs.worlds import CompiledWorld
 from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import Task
@@ -644,10 +644,19 @@ def config_for_task(task: Task, method: str, arm: str) -> RunConfig | None:
       method: name of its method.
       arm: `baseline` or `layout`.
     """
-    # Generated worlds differ in their tasks, so the task identifies the world.
+    # Generated worlds differ in rules and categories, which identify the world; goals and detector may be others.
     layout = LayoutConfig(counts="instances" if task.instance_counts else "presence")
-    for world in WORLDS:
-        config = dataclasses.replace(RunConfig(), world=world, method=method, arms=(arm,), seeds=1, layout=layout)
+    for name, world in WORLDS.items():
+        goals = None if world.task.goals == task.goals else task.goals
+        config = RunConfig(
+            world=name,
+            method=method,
+            arms=(arm,),
+            seeds=1,
+            layout=layout,
+            worlds=WorldConfig(goals=goals),
+            detector=task.detector,
+        )
         if config.task == task:
             return config
     return None

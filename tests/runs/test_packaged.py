@@ -1,5 +1,6 @@
 """An exported policy has the world of its task, and acts in it at several layout shifts."""
 
+import dataclasses
 import io
 import shutil
 
@@ -15,11 +16,15 @@ from jaxnav.runs.policies import (
     PACKAGED_POLICIES,
     POLICIES_DIR,
     config_for_policy,
+    config_for_task,
     find_policy_folder,
     is_policy,
+    list_packaged_policies,
     load_policy_as_run,
 )
 from jaxnav.runs.worlds import compile_evaluation_world
+from jaxnav.scenes.task import Detector, Rules
+from jaxnav.scenes.worlds import WORLDS
 from jaxnav.viz.episode import play_episode
 
 
@@ -32,6 +37,29 @@ def test_config_for_policy_names_the_world_of_its_task(drawn_run, tmp_path):
         policy["spec"]["task"]["rules"]["headings"] = 12
     with pytest.raises(InputError, match=r"no generated world has; give the run that it comes from$"):
         config_for_policy(export)
+
+
+@pytest.mark.parametrize("name", list_packaged_policies())
+def test_packaged_policies_act_in_the_world_of_their_name(name):
+    world, _, method = name.partition("-")
+    config, policies = load_policy_as_run(name)
+    assert (config.world, config.method, policies.num_seeds) == (world, method, 1)
+    assert config.task == policies.task == jaxnav.load_policy(name).task
+
+
+def test_packaged_policies_are_small():
+    num_bytes = sum(path.stat().st_size for path in PACKAGED_POLICIES.rglob("*") if path.is_file())
+    assert num_bytes <= 4_000_000
+
+
+def test_config_for_task_keeps_goals_and_detector():
+    houses = WORLDS["houses"].task
+    assert config_for_task(houses, "org", "layout").worlds.goals is None
+    task = dataclasses.replace(houses, goals=("Cup", "Book"), detector=Detector(false_alarm=0.25, seed=3))
+    config = config_for_task(task, "org", "layout")
+    assert (config.world, config.worlds.goals, config.detector) == ("houses", ("Cup", "Book"), task.detector)
+    # Other rules are those of no world.
+    assert config_for_task(dataclasses.replace(task, rules=Rules(headings=6)), "org", "layout") is None
 
 
 def test_packaged_policy_as_a_run_has_one_seed():

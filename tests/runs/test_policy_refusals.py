@@ -136,7 +136,8 @@ def test_load_policy_refuses_learned_arrays_that_do_not_fit_the_method(
 def test_load_policy_lists_packaged_policies_for_an_unknown_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(
-        InputError, match=r"^room-org: not an exported policy .*; export it, or load one of the package: rooms-org$"
+        InputError,
+        match=r"^room-org: not an exported policy .*; export it, or load one of the package: houses-belief, houses-org, rooms-org$",
     ):
         jaxnav.load_policy("room-org")
     assert jaxnav.load_policy("rooms-org").spec.method.name == "org"
