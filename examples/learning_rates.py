@@ -10,9 +10,9 @@ from rich.console import Console
 
 import jaxnav
 
-learning_rates, entropies = np.meshgrid([1e-3, 4e-3, 1e-2], [0.0, 0.01])
+learning_rate_grid, entropy_grid = np.meshgrid([1e-3, 4e-3, 1e-2], [0.0, 0.01])
 config = jaxnav.RunConfig(run_dir=Path("runs/learning_rates"), arms=("layout",), seeds=2, total_steps=500_000)
-runs = jaxnav.train_batch(config, Console(), learning_rate=learning_rates.ravel(), entropy=entropies.ravel())
+runs = jaxnav.train_batch(config, Console(), learning_rate=learning_rate_grid.ravel(), entropy=entropy_grid.ravel())
 
 # Success in val scenes with best actions, within the longest step limit.
 for run in runs:

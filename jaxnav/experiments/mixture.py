@@ -176,13 +176,13 @@ def _measure_removals(
     """Evaluate removals and their controls; see `measure_mixture`.
 
     Args:
-      bench, run, decoding, rules: as there.
+      bench, run, decoding, rules: see `measure_mixture`.
       remaining: decision that remains once experience is removed.
     """
     budgets = WORLDS[run.config.world].budgets
     shifts = (bench.config.shifts[0], bench.config.shifts[-1])
 
-    # The folds of a dataset have scenes and policies of their own. Training run s is that of all folds with seed s.
+    # Each fold has its own scenes and policies. Training run s of the dataset joins seed s of all folds.
     populations = []
     fold_outcomes = []
     for fold_run in run.fold_runs:
@@ -231,9 +231,16 @@ def _measure_removals(
 
 
 def _join_outcomes(parts: Sequence[Any]) -> Any:
-    """Join the outcomes of folds along their episodes; dictionaries of outcomes keep their order."""
+    """Join the outcomes of folds along their episodes.
+
+    Of dictionaries of outcomes, the names that all folds have are kept: a fold may lack the evidence of a gap.
+    """
     if isinstance(parts[0], dict):
-        return {name: _join_outcomes([part[name] for part in parts]) for name in parts[0]}
+        joined = {}
+        for name in parts[0]:
+            if all(name in part for part in parts):
+                joined[name] = _join_outcomes([part[name] for part in parts])
+        return joined
     return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *parts)
 
 

@@ -17,18 +17,32 @@ from jaxnav.scenes.task import MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT
 WORD_BITS = 32
 _LAST_BIT = np.uint32(WORD_BITS - 1)
 
-#: Steps between two updates of the numbers that `walking_steps` counts.
-STEPS_PER_COUNT = 8
+#: Steps in a round of `walking_steps`, and the binary digits of a step in its round.
+STEPS_PER_ROUND = 8
 _NUM_STEP_DIGITS = 3
-#: Binary digits in which it counts updates, and the largest number of steps that all digits hold.
-_NUM_COUNT_DIGITS = 5
-MAX_STEPS = STEPS_PER_COUNT * 2**_NUM_COUNT_DIGITS
+#: Binary digits of the number of rounds, and the largest number of steps that can be counted.
+_NUM_ROUND_DIGITS = 5
+MAX_STEPS = STEPS_PER_ROUND * 2**_NUM_ROUND_DIGITS
 
 #: State of the wave: number of steps, cells reached one step before, and cells reached so far.
 _Wave = tuple[jax.Array, jax.Array, jax.Array]
-#: State of a wave that is counted: number of updates, cells reached at the last update but one and at the last one,
-#: and digits of the updates that each cell waited for, and of its step after them.
-_CountingWave = tuple[jax.Array, jax.Array, jax.Array, tuple[jax.Array, ...], tuple[jax.Array, ...]]
+
+
+class _CountingWave(NamedTuple):
+    """State of a wave whose steps are counted, after some rounds.
+
+    Attributes:
+      num_rounds: int32 [], number of rounds.
+      reached_before, reached: uint32 [N, N / 32], cells reached one round before, and so far.
+      round_digits: bit i of the number of rounds that did not reach a cell is its bit on board i.
+      step_digits: the same for the step, 0 to 7, of the round that reached it.
+    """
+
+    num_rounds: jax.Array
+    reached_before: jax.Array
+    reached: jax.Array
+    round_digits: tuple[jax.Array, ...]
+    step_digits: tuple[jax.Array, ...]
 
 
 class PathField(NamedTuple):
@@ -111,48 +125,51 @@ def walking_steps(passable: jax.Array, start: jax.Array) -> jax.Array:
     reached = jnp.zeros_like(passable).at[start_row, start_column // WORD_BITS].set(start_bit)
     enterable = passable | reached
 
-    # The distance of a cell is the number of steps that do not reach it, plus 1. Whole updates without the cell are
-    # counted for all cells together: digit i of a cell's number is its bit on board i. The step after them is stored at
-    # the update that first has the cell.
+    # A cell that step s of round r is the first to reach is 8 r + s + 1 steps away. The digits of r and s are kept for
+    # all cells together.
     no_bits = jnp.zeros_like(passable)
-    no_digits = (no_bits,) * _NUM_COUNT_DIGITS, (no_bits,) * _NUM_STEP_DIGITS
 
     def is_spreading(wave: _CountingWave) -> jax.Array:
-        num_counts, reached_before, reached, _, _ = wave
-        return (num_counts < MAX_STEPS // STEPS_PER_COUNT) & ((num_counts == 0) | (reached != reached_before).any())
+        has_room = wave.num_rounds < MAX_STEPS // STEPS_PER_ROUND
+        return has_room & ((wave.num_rounds == 0) | (wave.reached != wave.reached_before).any())
 
     def spread(reached: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:
         next_reached = reached | (dilate_board(reached) & enterable)
         return next_reached, next_reached & ~reached
 
-    def spread_and_count(wave: _CountingWave) -> _CountingWave:
-        num_counts, _, reached, count_digits, step_digits = wave
-        next_reached, new_cells = jax.lax.scan(spread, reached, None, length=STEPS_PER_COUNT)
+    def spread_round(wave: _CountingWave) -> _CountingWave:
+        reached, new_cells = jax.lax.scan(spread, wave.reached, None, length=STEPS_PER_ROUND)
 
-        # Add 1 to the numbers of the cells that are still missing.
-        carry = ~next_reached
-        next_count_digits = []
-        for digit in count_digits:
-            next_count_digits.append(digit ^ carry)
+        # Add 1 to the rounds of the cells that are still missing.
+        carry = ~reached
+        round_digits = []
+        for digit in wave.round_digits:
+            round_digits.append(digit ^ carry)
             carry = digit & carry
 
-        # Store steps 0 to 7 of the new cells.
-        next_step_digits = list(step_digits)
-        for step in range(STEPS_PER_COUNT):
+        # Store the steps of the new cells.
+        step_digits = list(wave.step_digits)
+        for step in range(STEPS_PER_ROUND):
             for index in range(_NUM_STEP_DIGITS):
                 if step >> index & 1:
-                    next_step_digits[index] |= new_cells[step]
-        return num_counts + 1, reached, next_reached, tuple(next_count_digits), tuple(next_step_digits)
+                    step_digits[index] |= new_cells[step]
+        return _CountingWave(wave.num_rounds + 1, wave.reached, reached, tuple(round_digits), tuple(step_digits))
 
-    start_wave = (jnp.int32(0), reached, reached, *no_digits)
-    _, _, reached, count_digits, step_digits = jax.lax.while_loop(is_spreading, spread_and_count, start_wave)
+    start_wave = _CountingWave(
+        num_rounds=jnp.int32(0),
+        reached_before=reached,
+        reached=reached,
+        round_digits=(no_bits,) * _NUM_ROUND_DIGITS,
+        step_digits=(no_bits,) * _NUM_STEP_DIGITS,
+    )
+    last_wave = jax.lax.while_loop(is_spreading, spread_round, start_wave)
 
     # Read the numbers of all cells from the boards.
     steps = jnp.ones((passable.shape[0], passable.shape[0]), jnp.int32)
-    for index, digit in enumerate((*step_digits, *count_digits)):
+    for index, digit in enumerate((*last_wave.step_digits, *last_wave.round_digits)):
         steps += unpack_board(digit).astype(jnp.int32) << index
     steps = steps.at[start_row, start_column].set(0)
-    return jnp.where(unpack_board(reached), steps, -1)
+    return jnp.where(unpack_board(last_wave.reached), steps, -1)
 
 
 def follow_path(path_field: PathField, start: jax.Array, heading: jax.Array, strides: jax.Array) -> jax.Array:

@@ -395,9 +395,11 @@ def fill_world_defaults(config: RunConfig) -> RunConfig:
     )
 
 
+#: Largest number of policies of each arm.
+MAX_SEEDS = 1024
 #: Upper bounds of the run's own settings. Larger values would exhaust memory or counters before the run finishes.
 _MAX_VALUES = {
-    "seeds": 1024,
+    "seeds": MAX_SEEDS,
     "total_steps": 10**12,
     "chunk": 10**5,
     "save_every": 10**6,

@@ -63,15 +63,21 @@ def apply_yaml(default: Config, source: str | Path, configs: Mapping[str, Path] 
 
 
 def _apply_file(default: Config, path: Path, configs: Mapping[str, Path], extended_by: tuple[Path, ...]) -> Config:
-    if path in extended_by:
+    """Apply a file, after the configuration that it extends; `extended_by` are the resolved paths of its successors."""
+    if path.resolve() in extended_by:
         raise InputError(f"{path}: extends itself; name another configuration in extends")
     values = _load_yaml(path, configs)
     if isinstance(values, dict) and "extends" in values:
         # The extended configuration comes first, so that the values of this file replace its own.
-        extended_source = str(values.pop("extends"))
-        extended_path = configs.get(extended_source) or path.parent / expand_home(extended_source)
-        default = _apply_file(default, extended_path, configs, (*extended_by, path))
-    return default if not values else apply_values(default, values, path)
+        source = values.pop("extends")
+        if not isinstance(source, str) or not source:
+            value_text = _describe_value(source)
+            raise InputError(f"{path}: extends must be a name or a file, but is {value_text}; change the value")
+        extended_path = configs.get(source) or path.parent / expand_home(source)
+        if not extended_path.exists():
+            raise InputError(f"{path}: extends {source}, which does not exist; give {', '.join(configs)} or a file")
+        default = _apply_file(default, extended_path, configs, (*extended_by, path.resolve()))
+    return default if values is None else apply_values(default, values, path)
 
 
 def parse_setting(text: str, annotation: Any) -> Any:

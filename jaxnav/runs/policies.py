@@ -366,7 +366,10 @@ def load_policies(config: RunConfig, arms: Sequence[str] | None = None) -> Polic
             export_folders.append((arm, config.run_dir / POLICIES_DIR / f"{arm}-{seed}"))
     for _, folder in export_folders:
         if not folder.exists():
-            raise InputError(f"{folder}: is missing, so training has not finished; resume it by jaxnav train")
+            raise InputError(
+                f"{folder}: is missing, so training has not finished; resume it by jaxnav train (of a batch, give the "
+                "folder of one run, such as RUN/0)"
+            )
     loaded_exports = [load_params(folder) for _, folder in export_folders]
 
     # The last seed of the layout arm (else of the last arm) is the reference: its settings hold for all.
@@ -644,11 +647,12 @@ def config_for_task(task: Task, method: str, arm: str) -> RunConfig | None:
       method: name of its method.
       arm: `baseline` or `layout`.
     """
-    # Generated worlds differ in rules and categories, which identify the world; goals and detector may be others.
+    # Rules and categories identify a generated world; goals and detector may differ from its defaults.
     layout = LayoutConfig(counts="instances" if task.instance_counts else "presence")
     for name, world in WORLDS.items():
         goals = None if world.task.goals == task.goals else task.goals
-        config = RunConfig(
+        config = dataclasses.replace(
+            RunConfig(),
             world=name,
             method=method,
             arms=(arm,),

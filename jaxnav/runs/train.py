@@ -1,12 +1,12 @@
 """Training of a run, from the layout prior to the exported policies.
 
-`train` is the entry point. Before training, `explore_world`, `calibrate_estimator` and `learn_knowledge` collect the
-layout prior and everything else that is known from the training scenes; `prepare_training` stores the results in the
-run directory. `make_trainer` builds the trainer of all seeds
-of both arms (`baseline`: policies without the layout estimator, `layout`: with it), and `run_updates` trains chunk by
-chunk. A chunk is one compiled call of several updates in one bank of scenes (a shard, where scenes are streamed).
-Between chunks the run validates, logs and saves its policies. A run resumes from its last checkpoint, and a signal
-ends it after the current chunk (`Interrupts`).
+`train` is the entry point, and `batch.train_batch` that of several runs side by side; both call `train_points`. Before
+training, `explore_world`, `calibrate_estimator` and `learn_knowledge` collect the layout prior and everything else that
+is known from the training scenes; `prepare_training` stores the results in the run directory. `make_trainer` builds the
+trainer of all seeds of both arms (`baseline`: policies without the layout estimator, `layout`: with it), and
+`run_updates` trains chunk by chunk. A chunk is one compiled call of several updates in one bank of scenes (a shard,
+where scenes are streamed). Between chunks the run validates, logs and saves its policies. A run resumes from its last
+checkpoint, and a signal ends it after the current chunk (`Interrupts`).
 """
 
 import dataclasses
@@ -48,7 +48,7 @@ from jaxnav.runs.preparation import (
     load_preparation,
     save_preparation,
 )
-from jaxnav.runs.run import REACH_FILE, TIMES_FILE, Run, RunLogs, claim_run_dir, lock_run_dir, run_settings
+from jaxnav.runs.run import LOG_FILE, REACH_FILE, TIMES_FILE, Run, RunLogs, claim_run_dir, lock_run_dir, run_settings
 from jaxnav.runs.validation import SCORE_METRIC, Validator
 from jaxnav.runs.worlds import (
     CompiledWorld,
@@ -58,7 +58,14 @@ from jaxnav.runs.worlds import (
     prefetch_env_params,
 )
 from jaxnav.store.checkpoint import restore_checkpoint, save_checkpoint, set_aside_checkpoints_after
-from jaxnav.store.files import FolderLock, LogRow, make_manifest, read_log_rows, write_json_with_digest
+from jaxnav.store.files import (
+    FolderLock,
+    LogRow,
+    make_manifest,
+    read_log_rows,
+    write_json_with_digest,
+    write_log_rows,
+)
 from jaxnav.training.calibration import (
     REDUCTIONS,
     STRENGTHS,
@@ -93,7 +100,7 @@ _SIGHTING_WALK_FACTOR = 2
 
 #: Signals that end a run after the current chunk: Ctrl-C, and SIGTERM as schedulers send it.
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-#: Excess of the steps of a run over those asked for, from which it is printed.
+#: Relative excess of a run's steps over `total_steps` from which the run prints its true length.
 _NOTED_EXCESS = 0.05
 #: Width of the progress bar, and of the two times after it with the spaces between them, in columns.
 _BAR_WIDTH = 12
@@ -102,7 +109,8 @@ _TIMES_WIDTH = 17
 _CHUNKS_PER_LINE = 4
 
 
-#: Called after every chunk of updates with the chunk's rows of the training log, one for each arm and seed.
+#: Called in every process after every chunk of updates with the chunk's rows of the training log, one for each arm and
+#: seed; never for methods that are fitted without PPO.
 TrainCallback = Callable[[Sequence[LogRow]], None]
 
 
@@ -137,7 +145,7 @@ def train_points(
 
     Args:
       config: checked configuration that all share, with the directory of the training state; its seeds are those of
-        all points.
+        all points. A single run is its own point.
       points: checked configurations of the runs.
       console, callback: see `train`.
     """
@@ -151,7 +159,7 @@ def train_points(
     check_agreement(json.dumps(make_manifest(run_settings(config))))
     world = compile_training_world(config, console)
     manifest_fields = {"scenes_fingerprint": world.fingerprint, "budget": config.steps_by_purpose}
-    if len(points) > 1:
+    if list(points) != [config]:
         ppo_settings = [run_settings(point)["ppo"] for point in points]
         manifest_fields["points"] = {name: [settings[name] for settings in ppo_settings] for name in ppo_settings[0]}
     manifest = make_manifest(run_settings(config) | manifest_fields)
@@ -173,6 +181,12 @@ def _train_in_run_dir(
     callback: TrainCallback | None,
 ) -> None:
     """Train in a run directory whose lock is held; see `train_points`."""
+    # Such a directory was copied without its training state, or is that of a run of a batch.
+    if (config.run_dir / POLICIES_DIR).exists() and not has_preparation(config.run_dir):
+        raise InputError(
+            f"{config.run_dir}: holds trained policies without the state of their training; evaluate them, or train in "
+            "another --run-dir (a run of train_batch is trained by repeating that call)"
+        )
     warn_if_rollout_too_short(config, console)
     warn_if_more_steps(config, console)
     preparation = prepare_training(config, world, manifest, console)
@@ -181,8 +195,9 @@ def _train_in_run_dir(
         _finish_fitted_run(config, world, preparation, lock, stopwatch, console)
         return
 
-    # Draw the bank of scenes in which each chunk trains.
     trainer = make_trainer(config, world.env, estimator_config, knowledge, mesh, points)
+
+    # Draw the bank of scenes in which each chunk trains.
     bank_order = draw_bank_order(world, config.seed, config.total_updates // config.chunk)
     if len(world.banks) > 1:
         num_used = len(set(bank_order))
@@ -193,7 +208,8 @@ def _train_in_run_dir(
     env_params = world.make_env_params(bank_order[0])
     states, update = _restore_or_init(config, trainer, env_params, manifest, console)
     stopwatch = stopwatch.resume(config.run_dir / TIMES_FILE)
-    is_finished = update == config.total_updates and (config.run_dir / REACH_FILE).exists()
+    has_reach = all((point.run_dir / REACH_FILE).exists() for point in points)
+    is_finished = update == config.total_updates and has_reach
     validator = None if is_finished else _make_validator(config, trainer, knowledge, world, console)
 
     session = TrainingSession(
@@ -209,15 +225,15 @@ def _train_in_run_dir(
         for arm, arm_states in seed_states.items():
             point_states = arm_states[first_seed : first_seed + point.seeds]
             policies[arm] = [_best_params(state) for state in point_states]
-        first_seed += point.seeds
+        # Folders of the runs of a batch are made here; of a single run, this repeats the check.
         run_on_first_process(functools.partial(claim_run_dir, point))
+        if point.run_dir != config.run_dir:
+            run_on_first_process(functools.partial(_copy_logs, config, point, first_seed))
         export = functools.partial(_export_policies, point, policies, estimator_config, knowledge, exploration)
         run_on_first_process(export)
         if validator is not None:
-            with show_activity(console, "measuring the exported policies"):
-                success_by_budget = validator.success_by_budget(policies)
-            write_reach = functools.partial(write_json_with_digest, point.run_dir / REACH_FILE, success_by_budget)
-            run_on_first_process(write_reach)
+            _write_reach(point, validator, policies, console)
+        first_seed += point.seeds
     console.print(f"{config.run_dir}: done in {stopwatch.read()['wall_s']:.0f} s")
 
 
@@ -483,10 +499,33 @@ def _finish_fitted_run(
         except MissingSplitError as error:
             console.print(f"no val scenes, so the policies are not measured ({error})")
         else:
-            with show_activity(console, "measuring the policies"):
-                success_by_budget = validator.success_by_budget(policies)
-            run_on_first_process(lambda: write_json_with_digest(config.run_dir / REACH_FILE, success_by_budget))
+            _write_reach(config, validator, policies, console)
     console.print(f"{config.run_dir}: done in {stopwatch.read()['wall_s']:.0f} s")
+
+
+def _write_reach(
+    config: RunConfig, validator: Validator, policies: Mapping[str, Sequence[Params]], console: Console
+) -> None:
+    """Measure the exported policies of a run, and store their success within budgets of actions."""
+    with show_activity(console, "measuring the exported policies"):
+        success_by_budget = validator.success_by_budget(policies)
+    run_on_first_process(lambda: write_json_with_digest(config.run_dir / REACH_FILE, success_by_budget))
+
+
+def _copy_logs(config: RunConfig, point: RunConfig, first_seed: int) -> None:
+    """Give a run of a batch its rows of the training log, with its own numbers of seeds, and the times of all.
+
+    Args:
+      config: configuration of the batch.
+      point: configuration of the run.
+      first_seed: number of the run's first seed in the batch.
+    """
+    point_rows = []
+    for row in RunLogs(config).read(LOG_FILE):
+        if first_seed <= row["seed"] < first_seed + point.seeds:
+            point_rows.append(row | {"seed": row["seed"] - first_seed})
+    write_log_rows(point.run_dir / LOG_FILE, point_rows)
+    write_log_rows(point.run_dir / TIMES_FILE, RunLogs(config).read(TIMES_FILE))
 
 
 def make_trainer(

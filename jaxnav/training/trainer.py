@@ -31,14 +31,14 @@ TrainerStates = dict[str, Any]
 #: Metrics of a chunk of updates, by arm and seed.
 SeedMetrics = dict[str, list[dict[str, float]]]
 
-#: Purposes of the keys of the arms: policies without and with the layout estimator.
+#: Number folded into the run's key for each arm: policies without and with the layout estimator.
 ARM_KEY_PURPOSES = {"baseline": 0, "layout": 1}
 
 
 class Trainer:
     """Trainer of all arms and seeds of a run on one device.
 
-    Policies of one arm may also differ in the traced settings of PPO; *seed* then means one of all these policies.
+    Each arm has S policies, which may differ in their seed and in traced settings of PPO.
 
     Each arm is compiled once for each stage of its method. The seeds of all arms run side by side on the cores.
 
@@ -64,7 +64,7 @@ class Trainer:
           stage_scalars: traced settings of PPO of each stage, leaves [S].
           knowledge: layout priors and statistics from before training.
           key: typed PRNG key [] of all arms and seeds.
-          seeds: the S seeds of each arm; policies with other settings may have the same seed.
+          seeds: seed of each of the S policies; policies with other settings may have the same seed.
           chunk_size: updates in one call of `train`.
         """
         self.learners = dict(learners)
@@ -75,13 +75,13 @@ class Trainer:
         self._seeds = list(seeds)
         self._chunk_size = chunk_size
 
-        # Functions of each arm in each stage, (arm, stage index); those that train are compiled when they are needed.
+        # Jitted functions by arm, and those that restart by (arm, stage index). JAX compiles them at their first call.
         self._init_functions = {}
-        self._keep_functions = {}
+        self._keep_best_functions = {}
         self._restart_functions = {}
         for arm, learner in self.learners.items():
             self._init_functions[arm] = self._jit_init(self._stage_learner(arm, 0))
-            self._keep_functions[arm] = self._jit_update(learner.keep_if_best, (0, 0))
+            self._keep_best_functions[arm] = self._jit_update(learner.keep_if_best, (0, 0))
             for stage_index in range(len(self._stages)):
                 restart = self._stage_learner(arm, stage_index).restart_episodes
                 self._restart_functions[arm, stage_index] = self._jit_update(restart, (0, None, None, 0))
@@ -105,9 +105,9 @@ class Trainer:
         for arm, init in self._init_functions.items():
             arm_key = jax.random.fold_in(self._key, ARM_KEY_PURPOSES[arm])
             seed_states[arm] = []
-            for index, seed in enumerate(self._seeds):
+            for policy_index, seed in enumerate(self._seeds):
                 seed_key = jax.random.fold_in(arm_key, seed)
-                experience_prob = self._scalars_of_seed(0, index).experience_prob
+                experience_prob = self._policy_scalars(0, policy_index).experience_prob
                 seed_states[arm].append(init(seed_key, env_params, self._knowledge, experience_prob))
         return seed_states
 
@@ -117,8 +117,8 @@ class Trainer:
         for arm, arm_states in states.items():
             restart = self._restart_functions[arm, stage_index]
             new_states[arm] = []
-            for index, state in enumerate(arm_states):
-                experience_prob = self._scalars_of_seed(stage_index, index).experience_prob
+            for policy_index, state in enumerate(arm_states):
+                experience_prob = self._policy_scalars(stage_index, policy_index).experience_prob
                 new_states[arm].append(restart(state, env_params, self._knowledge, experience_prob))
         return new_states
 
@@ -133,7 +133,7 @@ class Trainer:
         for arm, arm_states in states.items():
             new_states[arm] = []
             for state, score in zip(arm_states, scores[arm], strict=True):
-                new_states[arm].append(self._keep_functions[arm](state, jnp.float32(score)))
+                new_states[arm].append(self._keep_best_functions[arm](state, jnp.float32(score)))
         return new_states
 
     def train(
@@ -155,13 +155,13 @@ class Trainer:
             train_functions[arm] = self._compiled_train(arm, stage_index, states[arm][0], env_params)
 
         def train_seed(job: tuple[str, int]) -> Any:
-            arm, index = job
-            scalars = self._scalars_of_seed(stage_index, index)
-            result = train_functions[arm](states[arm][index], scalars, env_params, self._knowledge)
+            arm, policy_index = job
+            scalars = self._policy_scalars(stage_index, policy_index)
+            result = train_functions[arm](states[arm][policy_index], scalars, env_params, self._knowledge)
             return jax.block_until_ready(result)
 
         # Seeds of all arms run in threads, as many as there are cores.
-        jobs = [(arm, index) for index in range(len(self._seeds)) for arm in self.learners]
+        jobs = [(arm, policy_index) for policy_index in range(len(self._seeds)) for arm in self.learners]
         with ThreadPoolExecutor(min(len(jobs), os.cpu_count() or 1)) as pool:
             results = list(pool.map(train_seed, jobs))
 
@@ -173,9 +173,9 @@ class Trainer:
             metrics[arm].append({name: float(value) for name, value in values.items()})
         return new_states, metrics
 
-    def _scalars_of_seed(self, stage_index: int, index: int) -> PPOScalars:
-        """Traced settings of a stage for the seed of this index."""
-        return jax.tree.map(operator.itemgetter(index), self._stage_scalars[stage_index])
+    def _policy_scalars(self, stage_index: int, policy_index: int) -> PPOScalars:
+        """Traced settings of a policy in a stage."""
+        return jax.tree.map(operator.itemgetter(policy_index), self._stage_scalars[stage_index])
 
     def _stage_learner(self, arm: str, stage_index: int) -> Learner:
         """Learner of an arm in a stage."""
@@ -191,7 +191,7 @@ class Trainer:
 
     def _scalars_argument(self, stage_index: int) -> PPOScalars:
         """Traced settings of a stage as the compiled function takes them."""
-        return self._scalars_of_seed(stage_index, 0)
+        return self._policy_scalars(stage_index, 0)
 
     # How a learner's functions are compiled; a trainer on several devices does it differently.
 
@@ -199,7 +199,12 @@ class Trainer:
         return jax.jit(learner.init)
 
     def _jit_update(self, function: Callable[..., LearnerState], seed_axes: tuple[int | None, ...]) -> Any:
-        """Jit a function of states, which it donates; `seed_axes` lists the arguments that have an axis of seeds."""
+        """Jit a function of states, which it donates.
+
+        Args:
+          function: takes the state of one policy first.
+          seed_axes: axes of `vmap` over policies, of the arguments; unused on one device.
+        """
         return jax.jit(function, donate_argnums=0)
 
     def _compile_train(self, learner: Learner, arguments: tuple[Any, ...]) -> Any:
@@ -274,7 +279,7 @@ class ShardedTrainer(Trainer):
         new_states: TrainerStates = {}
         for arm, stacked_state in states.items():
             seed_scores = np.array(scores[arm], np.float32)
-            new_states[arm] = self._keep_functions[arm](stacked_state, seed_scores)
+            new_states[arm] = self._keep_best_functions[arm](stacked_state, seed_scores)
         return new_states
 
     def train(

@@ -275,7 +275,7 @@ def draw_search(episodes: Sequence[PlayedEpisode], snapshots: Sequence[SearchSna
     # The legend stands to the right of the plans.
     goal_name = episodes[0].task.categories[episodes[0].goal]
     legend_handles = _legend_handles(goal_name, any(snapshot.is_searching for snapshot in snapshots))
-    if snapshots[0].beliefs:
+    if any(snapshot.beliefs for snapshot in snapshots):
         legend_handles.append(Patch(color=BELIEF_COLOR, alpha=_MAX_OPACITY, label=f"{goal_name} is likely here"))
     figure.legend(handles=legend_handles, loc="center left", bbox_to_anchor=(0.73, 0.5), fontsize=9, frameon=False)
     save_figure(figure, path)
@@ -285,7 +285,7 @@ def _draw_row(
     figure: Figure, bottom: float, height: float, episode: PlayedEpisode, snapshot: SearchSnapshot, step: int
 ) -> None:
     """Draw the panels of one episode in a part of the figure, with texts above them."""
-    projection = MapProjection(episode, snapshot)
+    # Title, goal and outcome, at fixed heights of the row.
     goal_name = episode.task.categories[episode.goal]
     status_text, status_color = describe_step(episode, step)
     figure.text(0.02, bottom + 0.945 * height, episode.title, color=MUTED_COLOR, fontsize=9.5)
@@ -294,6 +294,7 @@ def _draw_row(
     figure.text(0.98, bottom + 0.935 * height, status_text, color=status_color, fontsize=10.5, ha="right")
 
     # A panel for each belief; one panel without a belief.
+    projection = MapProjection(episode, snapshot)
     panel_titles = list(snapshot.beliefs) or [""]
     panel_width = 0.7 / len(panel_titles)
     panel_height = (0.82 if snapshot.beliefs else 0.85) * height

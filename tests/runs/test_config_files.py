@@ -232,14 +232,29 @@ def test_a_file_may_extend_another(tmp_path):
     assert apply_yaml(Config(), tmp_path / "third.yaml", configs) == dataclasses.replace(second, epsilons=())
 
 
-def test_a_file_may_not_extend_itself_or_a_missing_file(tmp_path):
-    (tmp_path / "first.yaml").write_text("extends: second.yaml\n")
+@pytest.mark.parametrize(
+    ("extends", "parts"),
+    [
+        ("second.yaml", ("first.yaml", "extends itself", "name another configuration")),
+        ("../{folder}/first.yaml", ("first.yaml", "extends itself")),
+        ("none.yaml", ("first.yaml", "extends none.yaml", "does not exist", "give")),
+        ("", ("first.yaml", "extends", "null", "change the value")),
+        ("''", ("first.yaml", "extends", "''", "change the value")),
+        ("[a, b]", ("first.yaml", "extends", "['a', 'b']", "change the value")),
+    ],
+)
+def test_impossible_extensions_are_refused(tmp_path, extends, parts):
+    (tmp_path / "first.yaml").write_text(f"extends: {extends.format(folder=tmp_path.name)}\n")
     (tmp_path / "second.yaml").write_text("extends: first.yaml\n")
-    (tmp_path / "third.yaml").write_text("extends: none.yaml\n")
-    with pytest.raises(InputError, match=r"first\.yaml: extends itself; name another configuration"):
+    with pytest.raises(InputError) as error:
         apply_yaml(Config(), tmp_path / "first.yaml")
-    with pytest.raises(InputError, match=r"none\.yaml: no such configuration; give"):
-        apply_yaml(Config(), tmp_path / "third.yaml")
+    assert_message_names(error.value, *parts)
+
+
+@pytest.mark.parametrize("text", ["false", "[]", "0", "''"])
+def test_a_file_must_hold_a_mapping(overlay, text):
+    with pytest.raises(InputError, match="give a mapping of names to values"):
+        overlay(text)
 
 
 @given(
