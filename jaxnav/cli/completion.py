@@ -35,7 +35,7 @@ _jaxnav_or_files() {
 complete -o default -F _jaxnav_or_files jaxnav
 """
 #: Longest description of an option, in characters: fish passes the script as an argument of at most 128 KiB.
-_MAX_DESCRIPTION = 34
+_MAX_DESCRIPTION = 60
 
 #: Rules by which tyro turns dataclasses into options with short descriptions.
 _SHORT_REGISTRY = ConstructorRegistry()
@@ -84,7 +84,7 @@ def make_script(shell: Shell) -> str:
     arguments = ["--tyro-write-completion", shell, "-"]
     with REGISTRY, contextlib.redirect_stdout(output), contextlib.suppress(SystemExit):
         tyro.cli(_make_subcommands(list_command_types()), args=arguments, prog="jaxnav", registry=_SHORT_REGISTRY)
-    script = output.getvalue()
+    script = _share_experiment_options(output.getvalue())
 
     # Complete file names where nothing else fits.
     if shell == "bash":
@@ -92,6 +92,20 @@ def make_script(shell: Shell) -> str:
     if shell == "zsh":
         return script.replace('\n_tyro_jaxnav "$@"\n', '\n_tyro_jaxnav "$@" || _files\n')
     return script
+
+
+def _share_experiment_options(script: str) -> str:
+    """Keep the options of experiments once, which tyro writes for each name.
+
+    All scripts hold a program in Python with a dictionary of the commands, `COMPLETION_SPEC`.
+    """
+    from jaxnav.experiments.config import EXPERIMENTS
+
+    name = next(iter(EXPERIMENTS))
+    _, _, after_name = script.partition(f"'{name}': {{'description': '{name}', 'options': ")
+    options, _, _ = after_name.partition(", 'subcommands': {}")
+    shared = script.replace(options, "EXPERIMENT_OPTIONS")
+    return shared.replace("COMPLETION_SPEC = ", f"EXPERIMENT_OPTIONS = {options}\nCOMPLETION_SPEC = ", 1)
 
 
 def list_command_types() -> dict[str, Any]:
