@@ -55,7 +55,8 @@ def test_a_short_or_failed_activity_gets_no_line(pipe):
 
 def test_a_terminal_shows_a_spinner_at_once(monkeypatch):
     monkeypatch.setattr(progress.threading, "Timer", None)  # no timer is made
-    terminal = Console(file=io.StringIO(), width=80, force_terminal=True, color_system=None)
+    output = io.StringIO()
+    terminal = Console(file=output, width=80, force_terminal=True, color_system=None)
     with show_activity(terminal, "compiling 20 scenes"):
         pass
-    assert "compiling 20 scenes" in terminal.file.getvalue()
+    assert "compiling 20 scenes" in output.getvalue()

@@ -1,6 +1,7 @@
 """Runs trained side by side, with different settings of PPO."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import numpy as np
@@ -23,7 +24,11 @@ def file_times(folder):
 def test_each_run_of_a_batch_is_the_run_that_train_gives(tmp_path):
     """Bit for bit, with best policies by validation and experience dropout, whose first draw precedes training."""
     config = tiny_config(tmp_path, arms=("layout",), counterfactual="none", validations=1)
-    settings = {"learning_rate": [1e-2, 3e-2], "entropy": np.array([0.0, 0.1]), "experience": (0.5, 0.9)}
+    settings: dict[str, Any] = {
+        "learning_rate": [1e-2, 3e-2],
+        "entropy": np.array([0.0, 0.1]),
+        "experience": (0.5, 0.9),
+    }
     chunk_rows = []
     batch = train_batch(config, callback=chunk_rows.append, **settings)
     # Two chunks; in each, a row for both seeds of both runs.
@@ -54,8 +59,9 @@ def test_each_run_of_a_batch_is_the_run_that_train_gives(tmp_path):
     assert [(run.config.run_dir / REACH_FILE).stat().st_mtime_ns for run in repeated] == reach_times
 
     # Other settings are another batch.
+    settings["learning_rate"] = [1e-2, 2e-2]
     with pytest.raises(InputError) as error:
-        train_batch(config, **settings | {"learning_rate": (1e-2, 2e-2)})
+        train_batch(config, **settings)
     assert_message_names(error.value, str(tmp_path / "run"), "learning_rate: [0.01, 0.03] != [0.01, 0.02]")
 
     # A run of the batch has no training state of its own, and is not trained over.

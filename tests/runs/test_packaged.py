@@ -54,9 +54,12 @@ def test_packaged_policies_are_small():
 
 def test_config_for_task_keeps_goals_and_detector():
     houses = WORLDS["houses"].task
-    assert config_for_task(houses, "org", "layout").worlds.goals is None
+    usual_config = config_for_task(houses, "org", "layout")
+    assert usual_config is not None
+    assert usual_config.worlds.goals is None
     task = dataclasses.replace(houses, goals=("Cup", "Book"), detector=Detector(false_alarm=0.25, seed=3))
     config = config_for_task(task, "org", "layout")
+    assert config is not None
     assert (config.world, config.worlds.goals, config.detector) == ("houses", ("Cup", "Book"), task.detector)
     # Other rules are those of no world.
     assert config_for_task(dataclasses.replace(task, rules=Rules(headings=6)), "org", "layout") is None
