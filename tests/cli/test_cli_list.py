@@ -24,7 +24,7 @@ def test_every_registry_is_listed_with_a_description(entries_by_kind):
     names_by_kind = {kind: [entry["name"] for entry in entries] for kind, entries in entries_by_kind.items()}
     assert names_by_kind["worlds"] == list(WORLDS)
     assert names_by_kind["methods"] == sorted(METHODS)
-    assert names_by_kind["policies"] == ["rooms-org"]
+    assert names_by_kind["policies"] == ["houses-belief", "houses-org", "rooms-org"]
     assert {"study", "table2", "mixture"} <= set(names_by_kind["experiments"])
     assert names_by_kind["configurations"] == list(CONFIGS)
     assert set(ESTIMATORS) - {"calibrated"} <= set(names_by_kind["settings"])  # `calibrated` is the default
@@ -40,7 +40,7 @@ def test_entries_hold_the_facts_of_their_kind(entries_by_kind):
     assert (rooms["scenes"]["val"], rooms["categories"], rooms["goals"], rooms["step_limit"]) == (20, 22, 22, 100)
     hosts_layout = {entry["name"]: entry["hosts_layout"] for entry in entries_by_kind["methods"]}
     assert (hosts_layout["org"], hosts_layout["anonymous"]) == (True, False)
-    (policy,) = entries_by_kind["policies"]
+    *_, policy = entries_by_kind["policies"]  # rooms-org
     assert (policy["method"], policy["world"], policy["arm"]) == ("org", "rooms", "layout")
     assert "92.2 %" in policy["summary"]
     experiments = {entry["name"]: entry for entry in entries_by_kind["experiments"]}

@@ -121,7 +121,7 @@ def test_eval_command_evaluates_an_agent_of_a_module(scene_file, capsys):
     [
         ("always:alway_done", "always has no alway_done; did you mean always_done?"),
         ("nowhere:AGENT", "cannot be imported (ModuleNotFoundError: No module named 'nowhere'); give package.module"),
-        ("rooms-orgg", "did you mean 'rooms-org'?"),
+        ("rooms-orgg", "did you mean 'rooms-org' or 'houses-org'?"),
         ("always:returns_logits", "returns_logits: it returned actions float64 [16, 6]; expected int [16], an index"),
     ],
 )
