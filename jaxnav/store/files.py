@@ -9,12 +9,13 @@ Log rows reach the disk before the checkpoint of their step is saved, so the log
 checkpoint. On resume, the rows after the restored step are dropped and written again.
 """
 
+import contextlib
 import hashlib
 import json
 import math
 import os
 import socket
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -60,13 +61,24 @@ def write_atomic(path: Path, data: bytes) -> None:
     # A part of the name keeps it within the limit of the file system.
     temporary_path = path.with_name(f".{path.name[:40]}.{os.getpid()}.tmp")
     try:
-        with temporary_path.open("wb") as temporary_file:
+        with _name_file(path), temporary_path.open("wb") as temporary_file:
             temporary_file.write(data)
             temporary_file.flush()
             os.fsync(temporary_file.fileno())  # the content is on the disk before the name points to it
         os.replace(temporary_path, path)
     finally:
         temporary_path.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _name_file(path: Path) -> Iterator[None]:
+    """Name the file in errors that name none, such as those of a full disk."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is None or error.filename is not None:
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 # JSON records with a digest
@@ -225,7 +237,7 @@ def append_log_rows(path: Path, rows: Sequence[LogRow]) -> None:
 
     A row has an int `step`. NaN and infinities are written as null, since JSON cannot express them.
     """
-    with path.open("ab") as log_file:
+    with _name_file(path), path.open("ab") as log_file:
         log_file.write(_encode_rows(rows))
         log_file.flush()
         os.fsync(log_file.fileno())
