@@ -200,7 +200,8 @@ class FolderLock:
         # The holder writes its name to the file, for the error message of later processes.
         self._descriptor = descriptor
         os.truncate(descriptor, 0)
-        os.write(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode())
+        with _name_file(self._path):
+            os.write(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode())
 
     def check(self) -> None:
         """Check that the locked folder has not been removed or replaced on disk.

@@ -21,7 +21,7 @@ def whole_run(tmp_path_factory):
 @pytest.mark.skipif(os.geteuid() != 0 or shutil.which("mount") is None, reason="only root mounts a file system")
 # Threads of Orbax end after the event loop of a checkpoint that could not be saved.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-@pytest.mark.parametrize("limit", [SIZE_LIMITS[2], SIZE_LIMITS[7], FILE_LIMITS[1], FILE_LIMITS[6]])
+@pytest.mark.parametrize("limit", [SIZE_LIMITS[0], SIZE_LIMITS[2], SIZE_LIMITS[7], FILE_LIMITS[1], FILE_LIMITS[6]])
 def test_training_on_a_full_disk_is_one_line_and_loses_nothing(whole_run, tmp_path, limit, capsys):
     if not can_mount(tmp_path / "probe"):
         pytest.skip("no file system can be mounted here")
