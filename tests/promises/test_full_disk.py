@@ -22,11 +22,11 @@ def whole_run(tmp_path_factory):
 # Threads of Orbax end after the event loop of a checkpoint that could not be saved.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("limit", [SIZE_LIMITS[0], SIZE_LIMITS[2], SIZE_LIMITS[7], FILE_LIMITS[1], FILE_LIMITS[6]])
-def test_training_on_a_full_disk_is_one_line_and_loses_nothing(whole_run, tmp_path, limit, capsys):
+def test_training_on_a_full_disk_is_one_line_and_loses_nothing(whole_run, tmp_path, limit):
     if not can_mount(tmp_path / "probe"):
         pytest.skip("no file system can be mounted here")
     config_file, whole_dir = whole_run
-    attempt = train_on_small_disk(config_file, tmp_path / "disk", limit, capsys.readouterr)
+    attempt = train_on_small_disk(config_file, tmp_path / "disk", limit)
     assert attempt.exit_code == 2, attempt
     assert attempt.message.startswith("error: "), attempt
     assert str(tmp_path / "disk") in attempt.message, attempt
