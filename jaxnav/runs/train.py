@@ -57,7 +57,7 @@ from jaxnav.runs.worlds import (
     draw_bank_order,
     prefetch_env_params,
 )
-from jaxnav.store.checkpoint import restore_checkpoint, save_checkpoint, set_aside_checkpoints_after
+from jaxnav.store.checkpoint import has_checkpoints, restore_checkpoint, save_checkpoint, set_aside_checkpoints_after
 from jaxnav.store.files import (
     FolderLock,
     LogRow,
@@ -181,8 +181,9 @@ def _train_in_run_dir(
     callback: TrainCallback | None,
 ) -> None:
     """Train in a run directory whose lock is held; see `train_points`."""
-    # Such a directory was copied without its training state, or is that of a run of a batch.
-    if (config.run_dir / POLICIES_DIR).exists() and not has_preparation(config.run_dir):
+    # A directory of policies alone was copied without its training state, or is that of a run of a batch.
+    has_training_state = has_preparation(config.run_dir) or has_checkpoints(config.run_dir)
+    if (config.run_dir / POLICIES_DIR).exists() and not has_training_state:
         raise InputError(
             f"{config.run_dir}: holds trained policies without the state of their training; evaluate them, or train in "
             "another --run-dir (a run of train_batch is trained by repeating that call)"

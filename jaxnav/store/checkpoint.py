@@ -151,6 +151,11 @@ def restore_checkpoint(
     return None
 
 
+def has_checkpoints(run_dir: Path) -> bool:
+    """True where checkpoints were stored, intact or damaged."""
+    return _checkpoints_folder(run_dir).is_dir()
+
+
 def set_aside_checkpoints_after(run_dir: Path, step: int) -> None:
     """Move the checkpoints later than a step to `run_dir/damaged`."""
     for folder in list(_checkpoints_folder(run_dir).glob("*")):
