@@ -1,8 +1,8 @@
 """Value of experience to the search by belief, and what removal makes of it under a shift.
 
 `python benchmarks/belief_search.py RUN [RUN ...] [--split val] [--episodes 240] [--shift 0 1] [--shift-by context]
-[--gap surprise] [--ablations]` evaluates runs of the method `belief`, or of a method with another predictor, with best
-actions on equal episodes. Rows of each run:
+[--gap surprise] [--ablations] [--perfect-detector]` evaluates runs of the method `belief`, or of a method with another
+predictor, with best actions on equal episodes. Rows of each run:
 
   nearest  the local policy alone, which walks to the nearest unexplored cell
   flat     all squares are equally likely, except for looks in vain
@@ -10,9 +10,13 @@ actions on equal episodes. Rows of each run:
   layout   the complete belief
   sTDE     removal by eq. 2 in the paper's form with epsilon 0, weighed by the gap of `--gap`
 
-With `--ablations` also `no looks`, the complete belief without looks in vain. Intervals are over floor plans and fits;
-those of differences are also given for these fits alone, `(these fits)`. The result goes to stdout as JSON, the tables
-to stderr.
+With `--ablations` also the complete belief without some of its parts, which are not fitted anew: `no looks`, without
+looks in vain; `no categories within R m`, for each radius of `LogLinear`; and `no categories`, with the floor alone by
+goal. `plan for every action` is the complete belief with a new target after each action. With `--perfect-detector`, all
+rows are evaluated with a detector that makes no errors; the fits stay.
+
+Intervals are over floor plans and fits; those of differences are also given for these fits alone, `(these fits)`. The
+result goes to stdout as JSON, the tables to stderr.
 """
 
 import argparse
@@ -35,12 +39,16 @@ from jaxnav.evaluation.grid import Evaluator, episode_metrics
 from jaxnav.evaluation.statistics import Clusters, Interval, mean_interval, paired_difference
 from jaxnav.evaluation.variants import EvaluationRow, table_row
 from jaxnav.policies.methods.belief import TargetControl
+from jaxnav.policies.methods.belief_map import RADII
+from jaxnav.policies.methods.map_tracker import SQUARE_CELLS
 from jaxnav.runs.evaluate import evaluate_rows
 from jaxnav.runs.policies import Policies
 from jaxnav.runs.run import Run
 from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world
+from jaxnav.scenes.scene import CELL_SIZE
+from jaxnav.scenes.tables.observation_row import PERFECT_DETECTOR
 
-#: (base, variant) pairs whose difference is reported.
+#: (base, variant) pairs whose difference is reported; those of ablations follow.
 PAIRS = (
     ("nearest", "layout"),
     ("flat", "layout"),
@@ -48,7 +56,6 @@ PAIRS = (
     ("places", "layout"),
     ("layout", "sTDE"),
     ("places", "sTDE"),
-    ("layout", "no looks"),
 )
 BUDGETS = (50, 150)
 #: Metrics [S, E] by name.
@@ -63,6 +70,7 @@ def main(
     shift_by: ShiftKind,
     gap: EstimatorName,
     has_ablations: bool,
+    has_perfect_detector: bool,
 ) -> None:
     results = []
     for run_dir in run_dirs:
@@ -70,12 +78,16 @@ def main(
         policies = run.policies(("layout",)).with_estimator(gap)
         for shift in shifts:
             console = Console(stderr=True)
-            world = compile_evaluation_world(run.config, split, None, shift, console, shift_by=shift_by)
+            config = run.config
+            if has_perfect_detector:
+                config = dataclasses.replace(config, detector=PERFECT_DETECTOR)
+            world = compile_evaluation_world(config, split, None, shift, console, shift_by=shift_by)
             result = measure_run(policies, world, num_episodes, has_ablations)
             result |= {"run": Path(run_dir).name, "method": run.config.method, "shift": shift}
             print(format_table(result), file=sys.stderr, flush=True)
             results.append(result)
     settings = {"split": split, "episodes": num_episodes, "shift_by": shift_by, "gap": gap}
+    settings["perfect_detector"] = has_perfect_detector
     print_report(settings | {"results": results})
 
 
@@ -86,7 +98,7 @@ def measure_run(policies: Policies, world: CompiledWorld, num_episodes: int, has
       policies: policies of the arm `layout`, one for each fit.
       world: compiled scenes.
       num_episodes: number of episodes.
-      has_ablations: whether the search without looks in vain is measured too.
+      has_ablations: whether the search without some of its parts is measured too.
     """
     layout_row = table_row("layout", None, None, "argmax")
     belief_rows = {
@@ -97,7 +109,7 @@ def measure_run(policies: Policies, world: CompiledWorld, num_episodes: int, has
     evaluator = Evaluator(policies.make_agent_loop(world), has_controls=False)
 
     # The nearest frontier does not depend on the fit.
-    nearest_policies = with_nearest_frontier(policies)
+    nearest_policies = with_control(policies, use_nearest_frontier=True)
     nearest_policies = nearest_policies._replace(params=jax.tree.map(lambda leaf: leaf[:1], policies.params))
     metrics, clusters = measure_rows({"nearest": layout_row}, nearest_policies, world, num_episodes)
     for metric, values in metrics["nearest"].items():
@@ -107,10 +119,15 @@ def measure_run(policies: Policies, world: CompiledWorld, num_episodes: int, has
     flat_policies = with_zeros(policies, "places", "method")
     metrics |= measure_rows({"flat": layout_row}, flat_policies, world, num_episodes, evaluator)[0]
     metrics |= measure_rows(belief_rows, policies, world, num_episodes, evaluator)[0]
+    pairs = list(PAIRS)
     if has_ablations:
-        no_looks = with_zeros(policies, "detection_rates")
-        metrics |= measure_rows({"no looks": layout_row}, no_looks, world, num_episodes, evaluator)[0]
-    return summarize(metrics, clusters)
+        for name, ablated_policies in ablate(policies).items():
+            metrics |= measure_rows({name: layout_row}, ablated_policies, world, num_episodes, evaluator)[0]
+            pairs.append(("layout", name))
+        name = "plan for every action"
+        metrics |= measure_rows({name: layout_row}, with_control(policies, interval=1), world, num_episodes)[0]
+        pairs.append(("layout", name))
+    return summarize(metrics, clusters, pairs)
 
 
 def measure_rows(
@@ -139,14 +156,34 @@ def with_zeros(policies: Policies, *groups: str) -> Policies:
     return policies._replace(params=policies.params | zeros)
 
 
-def with_nearest_frontier(policies: Policies) -> Policies:
-    """Policies whose choices are ignored for the nearest unexplored cell."""
-    method = dataclasses.replace(policies.spec.method, control=TargetControl(use_nearest_frontier=True))
+def ablate(policies: Policies) -> dict[str, Policies]:
+    """Policies without some of their parts, by name."""
+    ablated_policies = {"no looks": with_zeros(policies, "detection_rates")}
+    predictor_params = policies.params["method"]
+    if "relations" in predictor_params:  # those of `LogLinear`, [S, K, R, K]
+        relations = predictor_params["relations"]
+        for radius_index, radius in enumerate(RADII):
+            radius_m = radius * SQUARE_CELLS * CELL_SIZE
+            without_radius = relations.at[:, :, radius_index].set(0.0)
+            ablated_policies[f"no categories within {radius_m:g} m"] = _with_relations(policies, without_radius)
+        ablated_policies["no categories"] = _with_relations(policies, jnp.zeros_like(relations))
+    return ablated_policies
+
+
+def _with_relations(policies: Policies, relations: jax.Array) -> Policies:
+    """Policies with other weights of the categories nearby."""
+    predictor_params = policies.params["method"] | {"relations": relations}
+    return policies._replace(params=policies.params | {"method": predictor_params})
+
+
+def with_control(policies: Policies, **settings: Any) -> Policies:
+    """Policies whose local policy has other settings."""
+    method = dataclasses.replace(policies.spec.method, control=TargetControl(**settings))
     return policies._replace(spec=dataclasses.replace(policies.spec, method=method))
 
 
-def summarize(metrics: Mapping[str, Metrics], clusters: Clusters) -> dict[str, Any]:
-    """Means of all rows, and differences of pairs, with intervals."""
+def summarize(metrics: Mapping[str, Metrics], clusters: Clusters, pairs: Sequence[tuple[str, str]]) -> dict[str, Any]:
+    """Means of all rows, and differences of (base, variant) pairs, with intervals."""
     rows: dict[str, Any] = {}
     for name, row_metrics in metrics.items():
         rows[name] = {}
@@ -154,9 +191,7 @@ def summarize(metrics: Mapping[str, Metrics], clusters: Clusters) -> dict[str, A
             rows[name][metric] = mean_interval(values, clusters).to_json()
     differences: dict[str, Any] = {}
     fixed_differences: dict[str, Any] = {}
-    for base, variant in PAIRS:
-        if base not in metrics or variant not in metrics:
-            continue
+    for base, variant in pairs:
         label = f"{variant} - {base}"
         differences[label] = {}
         fixed_differences[f"{label} (these fits)"] = {}
@@ -190,6 +225,7 @@ if __name__ == "__main__":
     parser.add_argument("--shift-by", choices=get_args(ShiftKind), default="context")
     parser.add_argument("--gap", choices=get_args(EstimatorName), default="surprise")
     parser.add_argument("--ablations", action="store_true")
+    parser.add_argument("--perfect-detector", action="store_true")
     options = parser.parse_args()
     try:
         main(
@@ -200,6 +236,7 @@ if __name__ == "__main__":
             options.shift_by,
             options.gap,
             options.ablations,
+            options.perfect_detector,
         )
     except InputError as error:
         sys.exit(f"error: {error}")
