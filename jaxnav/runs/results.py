@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.grid import EpisodeOutcome, episode_metrics
-from jaxnav.evaluation.report import build_row, write_report
+from jaxnav.evaluation.report import build_row, markdown_table, write_report
 from jaxnav.evaluation.variants import EvaluationRow
 from jaxnav.store.files import write_atomic
 
@@ -32,6 +32,13 @@ class Results(NamedTuple):
     categories: tuple[str, ...]
     budgets: tuple[int, ...]
     report: dict[str, Any]
+
+    def __repr__(self) -> str:
+        """Table of the results in Markdown, as a notebook or `print` shows them."""
+        return markdown_table(self.report)
+
+    def _repr_markdown_(self) -> str:
+        return markdown_table(self.report)
 
     def metrics(self) -> dict[str, np.ndarray]:
         """Metrics of every episode, float64 [R, S, E].

@@ -158,3 +158,9 @@ def test_a_packaged_policy_is_evaluated_with_its_removals(scene_file):
     assert results.report["rows"][0]["sr"]["ci95"] is not None
     assert results.report["run"]["subject"] == "rooms-org"
     assert not any("training seed" in note for note in results.report["notes"])
+
+
+def test_printed_results_are_the_table(results):
+    for name in ("SR", "SPL", "Random", "Frontier"):
+        assert name in str(results)
+    assert max(map(len, str(results).splitlines())) < 400
