@@ -127,9 +127,10 @@ def test_gymnasium_refuses_other_render_modes():
 def test_record_video_writes_an_episode(gym_env, tmp_path):
     from gymnasium.wrappers import RecordVideo
 
-    recorder = RecordVideo(gym_env, str(tmp_path), episode_trigger=lambda episode: True)
+    video_folder = tmp_path / "videos"  # RecordVideo warns where the folder exists
+    recorder = RecordVideo(gym_env, str(video_folder), episode_trigger=lambda episode: True)
     recorder.reset(seed=0)
     for action in (1, 1, 5):
         recorder.step(action)
     recorder.stop_recording()
-    assert [path.suffix for path in tmp_path.iterdir()] == [".mp4"]
+    assert [path.suffix for path in video_folder.iterdir()] == [".mp4"]
