@@ -18,6 +18,7 @@ from jaxnav.policies.methods import method_label
 from jaxnav.progress import show_activity
 from jaxnav.report.charts import differences_chart, leads_chart, thresholds_chart, to_svg
 from jaxnav.report.config import ReportConfig
+from jaxnav.report.headline import make_headline
 from jaxnav.report.measure import ShiftMeasurements, measure_shift
 from jaxnav.report.page import Chart, Section, render_page, to_text_table
 from jaxnav.runs.run import Run
@@ -87,8 +88,14 @@ def make_report(run: Run, reference_run: Run | None, config: ReportConfig, conso
     page_title = f"{method_label(run.config.method)} in {first_row['world']}"
     replays_by_shift = [measurements.replays for measurements in by_shift.values()]
     with show_activity(console, "drawing the page"):
+        reports = {}
+        accounts = {}
+        for shift, measurements in by_shift.items():
+            reports[shift] = measurements.results.report
+            accounts[shift] = measurements.account
+        headline = make_headline(reports, accounts, config.threshold)
         sections = make_sections(run, by_shift, config.threshold)
-        return render_page(page_title, run_facts, sections, replays_by_shift)
+        return render_page(page_title, headline, run_facts, sections, replays_by_shift)
 
 
 def _check(run: Run, reference_run: Run | None, config: ReportConfig) -> None:

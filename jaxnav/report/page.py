@@ -1,6 +1,7 @@
 """The report's page: sections of text, tables and charts, and replays, as one self-contained HTML file.
 
-`render_page` renders the page from `Section`s, which hold `TextTable`s and `Chart`s, and from the data of the replays.
+`render_page` renders the page from a `Headline`, from `Section`s, which hold `TextTable`s and `Chart`s, and from the
+data of the replays. Terms of the glossary open their definitions where they stand, see `jaxnav.report.terms`.
 The page's layout, style and scripts are the files next to this module.
 """
 
@@ -17,7 +18,11 @@ from typing import Any, NamedTuple
 
 from rich.table import Table as ConsoleTable
 
+from jaxnav.evaluation.statistics import Interval
+from jaxnav.experiments.figures import interval_text
+from jaxnav.report.headline import Headline, KeyFigure
 from jaxnav.report.replays import Replays
+from jaxnav.report.terms import GLOSSARY, mark_terms
 
 
 class TextTable(NamedTuple):
@@ -78,13 +83,20 @@ def to_text_table(title: str, table: ConsoleTable) -> TextTable:
     return TextTable(title, tuple(column_headers), tuple(table_rows))
 
 
-def render_page(title: str, facts: Mapping[str, str], sections: Sequence[Section], replays: Sequence[Replays]) -> str:
+def render_page(
+    title: str,
+    headline: Headline,
+    facts: Mapping[str, str],
+    sections: Sequence[Section],
+    replays: Sequence[Replays],
+) -> str:
     """Return the page as HTML.
 
     Every text is escaped. The script is allowed by its digest alone, and the page can load nothing.
 
     Args:
       title: title of the page.
+      headline: main results.
       facts: facts about the run, by name.
       sections: sections in order; the replays follow the first.
       replays: replays at each shift.
@@ -112,16 +124,90 @@ def render_page(title: str, facts: Mapping[str, str], sections: Sequence[Section
         style=_read_resource("page.css"),
         script=page_script,
         data=_embed_json(list(map(dataclasses.asdict, replays))),
+        headline=_render_headline(headline),
         facts="".join(fact_items),
         links="".join(section_links),
         first=rendered_sections[0],
         others="\n".join(rendered_sections[1:]),
+        terms=_render_glossary(),
+        explanations=_render_explanations(),
     )
+
+
+def _render_headline(headline: Headline) -> str:
+    # Every term opens its definition at its first mention.
+    marked_keys: set[str] = set()
+    sentences = []
+    for sentence in headline.sentences:
+        sentences.append(mark_terms(html.escape(sentence), marked_keys))
+    figures = []
+    for figure in headline.figures:
+        figures.append(_render_figure(figure))
+    main_result, *other_results = sentences
+    text = _tag("p", main_result, "headline")
+    for result in other_results:
+        text += _tag("p", result, "finding")
+    return text + _tag("div", "".join(figures), "figures")
+
+
+def _render_figure(figure: KeyFigure) -> str:
+    """Return a figure as a list of its values, each with a drawing of its interval."""
+    number_format = "+.1f" if figure.is_difference else ".1f"
+    value_rows = []
+    for name, value in figure.values.items():
+        # The number, the drawing, and the bounds below.
+        number, _, bounds = interval_text(value, number_format).partition(" ")
+        number_html = f"{_tag('b', number)} {html.escape(figure.unit)}"
+        drawing = _draw_interval(value, figure.axis)
+        value_rows.append(_tag("dt", html.escape(name)) + _tag("dd", number_html + drawing + _tag("small", bounds)))
+    title = _tag("h3", html.escape(figure.title))
+    note = _tag("p", mark_terms(html.escape(figure.note), set()))
+    return _tag("div", title + _tag("dl", "".join(value_rows)) + note, "figure")
+
+
+def _draw_interval(value: Interval, axis: tuple[float, float]) -> str:
+    """Return a drawing of a value and its interval on an axis, which is an ornament next to the numbers."""
+    start, end = axis
+
+    def place(number: float) -> float:
+        return round(100 * (min(max(number, start), end) - start) / (end - start), 2)
+
+    shapes = ['<rect class="track" y="3" width="100" height="2"/>']
+    if start < 0 < end:
+        shapes.append(f'<rect class="zero" x="{place(0) - 0.25}" width="0.5" height="8"/>')
+    if value.has_bounds:
+        left = place(value.low)
+        width = max(place(value.high) - left, 0.5)
+        shapes.append(f'<rect class="bounds" x="{left}" y="2" width="{width}" height="4"/>')
+    if value.mean == value.mean:  # not NaN
+        shapes.append(f'<rect class="mean" x="{place(value.mean) - 0.5}" width="1" height="8"/>')
+    return f'<svg viewBox="0 0 100 8" preserveAspectRatio="none" aria-hidden="true">{"".join(shapes)}</svg>'
+
+
+def _render_glossary() -> str:
+    """Return the list of all terms."""
+    entries = []
+    for term in GLOSSARY:
+        name = f'<dt id="term-{term.key}">{html.escape(term.name)}</dt>'
+        entries.append(name + _tag("dd", html.escape(term.definition)))
+    return "".join(entries)
+
+
+def _render_explanations() -> str:
+    """Return the definitions that terms in the text open."""
+    explanations = []
+    for term in GLOSSARY:
+        explanations.append(
+            f'<div popover id="about-{term.key}" class="explanation">{_tag("b", html.escape(term.name))}'
+            f"{_tag('p', html.escape(term.definition))}</div>"
+        )
+    return "".join(explanations)
 
 
 def _render_section(section: Section) -> str:
     # The heading and the introduction, then charts and tables.
-    html_parts = [_tag("h2", html.escape(section.title)), _tag("p", html.escape(section.about), "about")]
+    about = mark_terms(html.escape(section.about), set())
+    html_parts = [_tag("h2", html.escape(section.title)), _tag("p", about, "about")]
     html_parts += map(_render_chart, section.charts)
     html_parts += map(_render_table, section.tables)
 
@@ -140,8 +226,9 @@ def _render_chart(chart: Chart) -> str:
 
 def _render_table(table: TextTable) -> str:
     table_caption = _tag("caption", html.escape(table.title))
-    header_row = _render_cells("th", table.header)
-    body_rows = [_render_row(row, len(table.header)) for row in table.rows]
+    marked_keys: set[str] = set()
+    header_row = _render_header(table.header, marked_keys)
+    body_rows = [_render_row(row, len(table.header), marked_keys) for row in table.rows]
 
     # The box around a table scrolls where the page is narrower.
     return (
@@ -150,17 +237,22 @@ def _render_table(table: TextTable) -> str:
     )
 
 
-def _render_row(row: Sequence[str], num_columns: int) -> str:
+def _render_row(row: Sequence[str], num_columns: int, marked_keys: set[str]) -> str:
     # A single cell is a heading across all columns; otherwise the first cell names the row.
     first_cell, *other_cells = row
     if not other_cells:
-        return f'<tr class="group"><th colspan="{num_columns}">{html.escape(first_cell)}</th></tr>'
-    return f"<tr>{_render_cells('th', [first_cell])}{_render_cells('td', other_cells)}</tr>"
+        heading = mark_terms(html.escape(first_cell), marked_keys)
+        return f'<tr class="group"><th colspan="{num_columns}" scope="rowgroup">{heading}</th></tr>'
+    row_name = mark_terms(html.escape(first_cell), marked_keys)
+    values = "".join(_tag("td", html.escape(cell)) for cell in other_cells)
+    return f'<tr><th scope="row">{row_name}</th>{values}</tr>'
 
 
-def _render_cells(name: str, cells: Sequence[str]) -> str:
-    """Return cells as elements of one name, `th` or `td`."""
-    return "".join(_tag(name, html.escape(cell)) for cell in cells)
+def _render_header(titles: Sequence[str], marked_keys: set[str]) -> str:
+    header_cells = []
+    for title in titles:
+        header_cells.append(f'<th scope="col">{mark_terms(html.escape(title), marked_keys)}</th>')
+    return "".join(header_cells)
 
 
 def _tag(name: str, content: str, css_class: str = "") -> str:

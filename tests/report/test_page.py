@@ -74,7 +74,14 @@ def test_hostile_names_add_no_tags_and_no_attributes(hostile_reader, plain_reade
 
 
 def test_hostile_names_are_shown_unchanged(hostile_reader):
-    for tag, text in (("h1", "title"), ("th", "row"), ("th", "group"), ("caption", "Shift 0"), ("dd", "run")):
+    for tag, text in (
+        ("h1", "title"),
+        ("th", "row"),
+        ("th", "group"),
+        ("h3", "figure"),
+        ("caption", "Shift 0"),
+        ("dd", "run"),
+    ):
         assert text + HOSTILE in hostile_reader.texts[tag], tag
     figure_labels = {attributes["aria-label"] for attributes in hostile_reader.attributes_of("figure")}
     assert figure_labels == {"chart" + HOSTILE}
@@ -129,6 +136,26 @@ def test_page_links_lead_to_its_sections(hostile_reader):
 def test_page_explains_the_terms_of_its_tables(plain_reader, term):
     assert term in plain_reader.texts["dt"]
     assert {"href": "#terms"} in plain_reader.attributes_of("a")
+
+
+def test_every_term_on_the_page_has_its_definition(plain_reader):
+    opened_ids = {
+        button["popovertarget"] for button in plain_reader.attributes_of("button") if "popovertarget" in button
+    }
+    popover_ids = {attributes["id"] for _, attributes in plain_reader.tags if "popover" in attributes}
+    assert "about-sr" in opened_ids
+    assert opened_ids <= popover_ids
+
+
+def test_ids_are_unique(plain_reader):
+    ids = [attributes["id"] for tag, attributes in plain_reader.tags if "id" in attributes and tag != "section"]
+    assert len(set(ids)) == len(ids)
+
+
+def test_headline_shows_its_figures_with_bounds(plain_reader):
+    assert "sentence" in plain_reader.texts["p"]
+    assert "50.0" in plain_reader.texts["b"]
+    assert {"[40.0, 60.0]", "[\N{MINUS SIGN}]"} <= set(plain_reader.texts["small"])
 
 
 def test_to_text_table_copies_the_cells_of_a_console_table():

@@ -4,6 +4,8 @@ import dataclasses
 
 import numpy as np
 
+from jaxnav.evaluation.statistics import Interval
+from jaxnav.report.headline import Headline, KeyFigure
 from jaxnav.report.page import Chart, Section, TextTable, render_page
 from jaxnav.report.replays import ReplayEpisode, Replays, ReplayTrace, make_plan, pack_shares
 from jaxnav.scenes.task import DONE, NUM_ACTIONS
@@ -61,4 +63,9 @@ def example_page(suffix=""):
     table = TextTable("Shift 0" + suffix, ("Variant" + suffix, "SR"), rows)
     chart = Chart('<svg viewBox="0 0 1 1"><rect width="1" height="1"/></svg>', "chart" + suffix)
     section = Section("Results" + suffix, "about" + suffix, (chart,), (table,), (table,), ("note" + suffix,))
-    return render_page("title" + suffix, {"Run": "run" + suffix}, [section, section], [example_replays(suffix)])
+    values = {"Shift 0" + suffix: Interval(50.0, 40.0, 60.0), "Shift 1" + suffix: Interval(45.0)}
+    figure = KeyFigure("figure" + suffix, "note" + suffix, "%", (0.0, 100.0), values)
+    headline = Headline(("sentence" + suffix,), (figure,))
+    return render_page(
+        "title" + suffix, headline, {"Run": "run" + suffix}, [section, section], [example_replays(suffix)]
+    )
