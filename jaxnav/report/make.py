@@ -10,19 +10,32 @@ import numpy as np
 from rich.console import Console
 
 from jaxnav.errors import InputError
-from jaxnav.evaluation.report import accounting_table, difference_table, results_table, row_label
+from jaxnav.evaluation.report import (
+    accounting_table,
+    decision_share_table,
+    difference_table,
+    has_decision_shares,
+    results_table,
+    row_label,
+)
 from jaxnav.experiments.figures import gap_figure, similarity_figure
 from jaxnav.experiments.gap_traces import BELIEFS, mean_by_step, truncate_to_shortest
 from jaxnav.experiments.table import Curve
 from jaxnav.policies.methods import method_label
 from jaxnav.progress import show_activity
-from jaxnav.report.charts import differences_chart, leads_chart, thresholds_chart, to_svg
+from jaxnav.report.charts import (
+    differences_chart,
+    leads_chart,
+    learning_chart,
+    make_chart,
+    shares_chart,
+    thresholds_chart,
+)
 from jaxnav.report.config import ReportConfig
 from jaxnav.report.headline import make_headline
 from jaxnav.report.measure import ShiftMeasurements, measure_shift
-from jaxnav.report.page import Chart, Section, render_page, to_text_table
+from jaxnav.report.page import Section, render_page, to_text_table
 from jaxnav.runs.run import Run
-from jaxnav.viz.learning import learning_figure
 
 #: Report of an evaluation, as in JSON.
 _Report = dict[str, Any]
@@ -37,7 +50,16 @@ _ACCOUNT_TEXT = (
     "experience; at shift 1 a negative lead is the cost of experience. A removal of experience leaves a share of the "
     "lead (“left”): the kept share of the value, or 100 % minus the recovered share of the cost."
 )
-_LEARNING_TEXT = "Success during training, in training scenes and in val scenes, and success of the exported policies."
+_SHARES_TEXT = (
+    "The share of decisions whose best action changes if one part of the decision is replaced by that of another "
+    "episode. Experience reaches a decision through Z, which combines the detections of all categories with the layout "
+    "weights. If few decisions depend on other categories in Z, neither w nor sTDE can change much. Bars are 95 % "
+    "intervals."
+)
+_LEARNING_TEXT = (
+    "Success during training, in training scenes and in val scenes, and success of the exported policies. Bands reach "
+    "from the worst to the best training run in val scenes, with best actions."
+)
 _THRESHOLDS_TEXT = (
     "sTDE removes experience where the layout gap exceeds the threshold ε. For ε ≥ 1 no experience is removed. Best "
     "actions; bands are 95 % intervals."
@@ -126,6 +148,7 @@ def make_sections(run: Run, by_shift: Mapping[float, ShiftMeasurements], thresho
     optional_sections = [
         _results_section(reports, threshold),
         _account_section(by_shift, threshold),
+        _shares_section(reports),
         _learning_section(run),
         _thresholds_section(reports),
         _gap_section(run, by_shift),
@@ -188,12 +211,21 @@ def _account_section(by_shift: Mapping[float, ShiftMeasurements], threshold: flo
     return Section("Value and cost of experience", _ACCOUNT_TEXT, (leads_chart(accounts),), tuple(text_tables))
 
 
+def _shares_section(reports: Mapping[float, _Report]) -> Section | None:
+    # Agents without learned decisions have no shares, at any shift.
+    if not all(has_decision_shares(report) for report in reports.values()):
+        return None
+    tables = []
+    for shift, report in reports.items():
+        tables.append(to_text_table(f"Shift {shift:g}, all decision shares", decision_share_table(report)))
+    return Section("Decision shares", _SHARES_TEXT, (shares_chart(reports),), folded=tuple(tables))
+
+
 def _learning_section(run: Run) -> Section | None:
     log_rows = run.log()
     if not log_rows:
         return None
-    figure = learning_figure(log_rows, run.success_by_budget(), method_label(run.config.method))
-    chart = Chart(to_svg(figure), "Learning curves: success during training, and success within a number of actions.")
+    chart = learning_chart(log_rows, run.success_by_budget(), method_label(run.config.method))
     return Section("Learning", _LEARNING_TEXT, (chart,))
 
 
@@ -223,7 +255,7 @@ def _gap_section(run: Run, by_shift: Mapping[float, ShiftMeasurements]) -> Secti
         for belief, belief_index in BELIEFS.items():
             curve_by_line[shift, belief] = Curve(steps, *gap_bounds[:, belief_index])
     figure = gap_figure({run.config.layout.setting: curve_by_line})
-    return Section("Layout gap", _GAP_TEXT, (Chart(to_svg(figure), "Mean layout gap by step."),))
+    return Section("Layout gap", _GAP_TEXT, (make_chart(figure, "Mean layout gap by step."),))
 
 
 def _similarity_section(by_shift: Mapping[float, ShiftMeasurements]) -> Section | None:
@@ -238,5 +270,5 @@ def _similarity_section(by_shift: Mapping[float, ShiftMeasurements]) -> Section 
     # The text names the row that the chart shows.
     first_report = next(iter(by_shift.values())).results.report
     section_text = _SIMILARITY_TEXT.format(row=row_label(first_report["rows"][0]))
-    chart = Chart(to_svg(similarity_figure(similarity_by_shift)), "Success against layout similarity.")
+    chart = make_chart(similarity_figure(similarity_by_shift), "Success against layout similarity.")
     return Section("Success and layout similarity", section_text, (chart,))

@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from jaxnav.viz.style import TEXT_COLOR, default_style, freeze_axes_positions, make_panels, set_panel_title
 
 #: Color of the curves of each arm.
-_ARM_COLORS = {"baseline": "#D55E00", "layout": "#0072B2"}
+ARM_COLORS = {"baseline": "#D55E00", "layout": "#0072B2"}
 
 # Styles of the curves: of val episodes with best and with sampled actions, and of training scenes.
 _LINE: dict[str, Any] = {"lw": 1.4, "ms": 3.5}
@@ -37,12 +37,12 @@ def learning_figure(
     # The right panel has the budgets, if they were measured.
     figure, panels = make_panels(1, 1 if success_by_budget is None else 2, height=3.2, sharey=True)
     logged_arms = {row["arm"] for row in rows}
-    arms = [arm for arm in _ARM_COLORS if arm in logged_arms]
+    arms = [arm for arm in ARM_COLORS if arm in logged_arms]
 
     # Curves of the training log.
     log_axes = panels[0, 0]
     for arm in arms:
-        color = _ARM_COLORS[arm]
+        color = ARM_COLORS[arm]
         log_axes.plot(*_mean_curve(rows, arm, "success"), color=color, **_TRAINING_STYLE)
         log_axes.plot(*_mean_curve(rows, arm, "val_success"), color=color, **_BEST_STYLE)
         log_axes.plot(*_mean_curve(rows, arm, "val_success_sampled"), color=color, **_SAMPLED_STYLE)
@@ -54,7 +54,7 @@ def learning_figure(
         budget_axes = panels[0, 1]
         budgets = success_by_budget["budgets"]
         for arm in arms:
-            color = _ARM_COLORS[arm]
+            color = ARM_COLORS[arm]
             val_success = success_by_budget["val"][arm]
             training_success = success_by_budget["train"][arm]
             budget_axes.plot(budgets, _percent(val_success["argmax"]), color=color, **_BEST_STYLE)
@@ -99,7 +99,7 @@ def _add_legend(figure: Figure, arms: Sequence[str]) -> None:
     # Colors stand for arms, line styles for the episodes.
     handles = []
     for arm in arms:
-        handles.append(Line2D([], [], label=arm, color=_ARM_COLORS[arm], lw=3))
+        handles.append(Line2D([], [], label=arm, color=ARM_COLORS[arm], lw=3))
     for style_label, line_style in styles.items():
         handles.append(Line2D([], [], label=style_label, color=TEXT_COLOR, **line_style))
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=8, frameon=False)
