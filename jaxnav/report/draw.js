@@ -49,7 +49,43 @@ function drawPlan(plan, categories, goal) {
     return [category === goal, thing];
   });
   things.sort((a, b) => a[0] - b[0]).forEach(([, thing]) => drawing.append(thing));
-  return { drawing, unit };
+  const labels = placeLabels(plan, categories, goal, unit);
+  drawing.append(...labels.map((label) => label.text), ...scaleBar(x, -z + 2.4 * unit, unit));
+  return { drawing, unit, labels };
+}
+
+// Names of objects, the goal first; a name that would cover another name or a dot is left to the dot's title.
+
+const SHARED = 100; // centimetres within which objects of a category share a name
+
+function placeLabels(plan, categories, goal, unit) {
+  const [x, z, width, depth] = plan.box, high = 2.9 * unit, gap = 1.2 * unit, edge = 3 * unit;
+  const taken = plan.objects.map(([, ox, oz]) => [ox - 0.6 * unit, -oz - 0.6 * unit, 1.2 * unit, 1.2 * unit]);
+  const labels = [], objects = [...plan.objects].sort((a, b) => (b[0] === goal) - (a[0] === goal));
+  for (const [category, ox, oz] of objects) {
+    if (labels.some((label) => label.category === category && Math.hypot(label.x - ox, label.z - oz) < SHARED)) continue;
+    const sought = category === goal, wide = 0.58 * high * categories[category].length;
+    const away = sought ? 2.6 * unit : gap;
+    const corners = [
+      [away, -high / 2], [-away - wide, -high / 2], [-wide / 2, -away - high], [-wide / 2, away],
+      [away / 2, -away - high], [away / 2, away], [-wide - away / 2, -away - high], [-wide - away / 2, away],
+    ];
+    const boxes = corners.map(([dx, dy]) => [ox + dx, -oz + dy, wide, high]);
+    const inside = ([bx, by]) => bx > x - edge && bx + wide < x + width + edge && by > -z - depth - edge && by + high < -z + edge;
+    const box = boxes.find((place) => inside(place) && !taken.some((other) => overlap(place, other))) ?? (sought ? boxes[0] : null);
+    if (!box) continue;
+    taken.push(box);
+    const text = shape("text", { class: sought ? "label sought" : "label", x: box[0], y: box[1] + 0.8 * high }, categories[category]);
+    labels.push({ category, x: ox, z: oz, text });
+  }
+  return labels;
+}
+
+const overlap = ([ax, ay, aw, ah], [bx, by, bw, bh]) => ax < bx + bw && bx < ax + aw && ay < by + bh && by < ay + ah;
+
+function scaleBar(x, y, unit) {
+  return [shape("path", { class: "scale", d: `M${x},${y - 0.7 * unit} v${0.7 * unit} h100 v${-0.7 * unit}`, "stroke-width": 0.35 * unit }),
+    shape("text", { class: "label", x: x + 100 + unit, y }, "1 m")];
 }
 
 function roomName({ name, cells }) {
@@ -66,17 +102,19 @@ function star(x, y, size) {
   return shape("polygon", { class: "goal", points: points.join(" "), "stroke-width": 0.15 * size });
 }
 
-function drawView(view, optics, categories, unit, goal) {
+function drawView(view, optics, categories, unit, goal, labels) {
   const depths = unpack(view.cone), { field_of_view: width, reach } = optics;
   const outline = Array.from(depths, (depth, i) => {
     const angle = ((view.yaw + width * (i / (depths.length - 1) - 0.5)) * Math.PI) / 180;
     return `${view.x + depth * reach * Math.sin(angle)},${-view.z - depth * reach * Math.cos(angle)}`;
   });
+  // A detection has a name of its own where no object of the category is named nearby, as at a false alarm.
+  const named = (category, x, z) => labels.some((label) => label.category === category && Math.hypot(label.x - x, label.z - z) < SHARED);
   const rings = view.seen.flatMap(([category, x, z]) => [
     shape("circle", {
       class: category === goal ? "ring sought" : "ring", cx: x, cy: -z, r: 1.7 * unit, "stroke-width": 0.45 * unit,
     }),
-    shape("text", { x: x + 2.3 * unit, y: -z + unit }, categories[category]),
+    ...(named(category, x, z) ? [] : [shape("text", { class: "detection", x: x + 2.3 * unit, y: -z + unit }, categories[category])]),
   ]);
   const arrow = shape("path", {
     class: "agent", d: "M0,-1 L.75,.9 L0,.45 L-.75,.9 Z", "stroke-width": 0.14,

@@ -14,7 +14,7 @@ function makeSide(number) {
   const { players, thresholds, plans, categories } = shown(), episode = current(), plan = plans[episode.plan];
   const player = state.players[number], course = episode.courses[player];
   const [gap, weight, layout, chances] = [course.gap, course.weight, course.layout, course.chances].map(unpack);
-  const { drawing, unit } = drawPlan(plan, categories, episode.goal);
+  const { drawing, unit, labels } = drawPlan(plan, categories, episode.goal);
   const moving = shape("g"), doing = element("span"), level = element("span"), cursor = shape("line", { class: "cursor" });
   const [actions, seen, layouts] = [0, 1, 2].map(() => element("div", { className: "bars" }));
   const choice = element("select", { ariaLabel: number ? "Right agent" : "Left agent" },
@@ -38,7 +38,8 @@ function makeSide(number) {
     moving.replaceChildren(
       shape("polyline", { class: "path", points: path.join(" "), "stroke-width": 0.7 * unit }),
       shape("circle", { class: "start", cx: sx, cy: sy, r: unit, "stroke-width": 0.4 * unit }),
-      ...drawView(view, shown(), categories, unit, episode.goal));
+      shape("text", { class: "label", x: Number(sx) + 1.6 * unit, y: Number(sy) + 3.2 * unit }, at ? "start" : ""),
+      ...drawView(view, shown(), categories, unit, episode.goal, labels));
     const action = course.actions[at], ended = step >= course.actions.length;
     doing.textContent = ended ? `ended at step ${at + 1}` : `step ${at + 1}: ${ACTIONS[action]}`;
     level.textContent = `D ${gap[at].toFixed(2)}, removed share ${weight[at].toFixed(2)}`;

@@ -23,7 +23,8 @@ const seen = [], by = (query) => [...document.querySelectorAll(query)];
 const read = () => seen.push({
   step: document.getElementById("step").value,
   now: document.getElementById("now").textContent,
-  agents: by(".agent").map((agent) => agent.getAttribute("transform")),
+  agents: by(".plan .agent").map((agent) => agent.getAttribute("transform")),
+  labels: by(".side:first-child .plan .label").map((label) => label.textContent).filter(Boolean),
   cursors: by(".cursor").map((cursor) => Number(cursor.getAttribute("x1"))),
 });
 const section = document.getElementById("replays"), slider = document.getElementById("step");
@@ -106,6 +107,16 @@ def test_slider_moves_both_agents_in_step(verdict):
         assert agent_places == expected_places
         assert state["cursors"] == [min(step, 2) + 0.5, step + 0.5]
     assert len({tuple(state["agents"]) for state in slider_states}) > 3
+
+
+def test_plan_names_the_goal_and_objects_and_shows_start_and_scale(verdict):
+    replays = example_replays()
+    goal = replays.categories[replays.episodes[1].goal]
+    categories_in_plan = {replays.categories[category] for category, *_ in replays.plans[0].objects}
+    labels = verdict["seen"][2]["labels"]
+    assert labels[0] == goal
+    assert {"1 m", "start"} <= set(labels)
+    assert set(labels) - {"1 m", "start"} <= categories_in_plan
 
 
 def test_keys_step_and_change_the_episode(verdict):
