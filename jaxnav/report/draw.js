@@ -18,6 +18,14 @@ function shape(name, attributes = {}, ...children) {
   return made;
 }
 
+// A word that opens its definition of the glossary.
+
+function term(word, key) {
+  const button = element("button", { type: "button", className: "term" }, word);
+  button.setAttribute("popovertarget", `about-${key}`);
+  return button;
+}
+
 const unpack = (text) => Float64Array.from(atob(text), (byte) => byte.charCodeAt(0) / 255);
 const rectangle = ([x, z, width, height], kind) => shape("rect", { x, y: -z - height, width, height, class: kind });
 
@@ -42,6 +50,8 @@ function drawPlan(plan, categories, goal) {
     drawing.append(box);
   }
   for (const floor of plan.floors) if (floor.name) drawing.append(roomName(floor));
+  const heat = shape("g", { class: "heat" });
+  drawing.append(heat);
   const things = plan.objects.map(([category, ox, oz]) => {
     const thing = category === goal ? star(ox, -oz, 2.2 * unit)
       : shape("circle", { class: "object", cx: ox, cy: -oz, r: 0.55 * unit });
@@ -51,7 +61,25 @@ function drawPlan(plan, categories, goal) {
   things.sort((a, b) => a[0] - b[0]).forEach(([, thing]) => drawing.append(thing));
   const labels = placeLabels(plan, categories, goal, unit);
   drawing.append(...labels.map((label) => label.text), ...scaleBar(x, -z + 2.4 * unit, unit));
-  return { drawing, unit, labels };
+  return { drawing, unit, labels, heat };
+}
+
+// The belief before a step: squares in the opacity of their probability over that of the likeliest square.
+
+const FAINT = 0.03, STRONG = 0.75;
+
+function drawBelief({ steps, corner: [x, z], side, columns }, shares, step) {
+  const frame = steps.filter((chosen) => chosen <= step).length - 1;
+  const squares = frame < 0 ? 0 : shares.length / steps.length, drawn = [];
+  for (let square = 0; square < squares; square++) {
+    const share = shares[frame * squares + square];
+    if (share < FAINT) continue;
+    const place = [x + (square % columns) * side, z + Math.floor(square / columns) * side, side, side];
+    const drawing = rectangle(place, "square");
+    drawing.setAttribute("fill-opacity", STRONG * share);
+    drawn.push(drawing);
+  }
+  return drawn;
 }
 
 // Names of objects, the goal first; a name that would cover another name or a dot is left to the dot's title.

@@ -35,6 +35,7 @@ from jaxnav.report.config import ReportConfig
 from jaxnav.report.headline import make_headline
 from jaxnav.report.measure import ShiftMeasurements, measure_shift
 from jaxnav.report.page import Section, render_page, to_text_table
+from jaxnav.report.replays import TrainedLayout
 from jaxnav.runs.run import Run
 
 #: Report of an evaluation, as in JSON.
@@ -43,7 +44,7 @@ _Report = dict[str, Any]
 _RESULTS_TEXT = (
     "SR is the success rate, SPL weights success by the shortest path, and DTS is the distance to success at the end. "
     "Brackets hold 95 % intervals over training runs and scenes. At layout shift 1 all categories of a scene have "
-    "exchanged places. The end of the page explains all terms."
+    "exchanged places. Words with a dotted line open their definition."
 )
 _ACCOUNT_TEXT = (
     "The lead of the run over layout-blind agents, on the same episodes. At shift 0 the lead is the value of "
@@ -86,11 +87,8 @@ def make_report(run: Run, reference_run: Run | None, config: ReportConfig, conso
     Raises:
       InputError: no finished run, an impossible option, or runs that cannot be compared.
     """
-    # Measure at each shift once, in the order given.
     _check(run, reference_run, config)
-    by_shift: dict[float, ShiftMeasurements] = {}
-    for shift in dict.fromkeys(config.shift):
-        by_shift[shift] = measure_shift(run, reference_run, shift, config, console)
+    by_shift = measure_shifts(run, reference_run, config, console)
 
     # The header states facts that are equal at all shifts, so that the first report serves.
     report = next(iter(by_shift.values())).results.report
@@ -118,6 +116,28 @@ def make_report(run: Run, reference_run: Run | None, config: ReportConfig, conso
         headline = make_headline(reports, accounts, config.threshold)
         sections = make_sections(run, by_shift, config.threshold)
         return render_page(page_title, headline, run_facts, sections, replays_by_shift)
+
+
+def measure_shifts(
+    run: Run, reference_run: Run | None, config: ReportConfig, console: Console
+) -> dict[float, ShiftMeasurements]:
+    """Measure at each shift once, and return the measurements in the order of the options."""
+    # The layout of training comes first, so that replays of other layouts can show it, too.
+    shifts = list(dict.fromkeys(config.shift))
+    trained_shift = run.config.worlds.shift
+    trained_layout = None
+    measured: dict[float, ShiftMeasurements] = {}
+    if trained_shift in shifts:
+        measured[trained_shift] = measure_shift(run, reference_run, trained_shift, config, console)
+        world = measured[trained_shift].world
+        # Streamed scenes are divided otherwise at other shifts.
+        if len(world.banks) == 1:
+            trained_layout = TrainedLayout(trained_shift, world)
+
+    for shift in shifts:
+        if shift not in measured:
+            measured[shift] = measure_shift(run, reference_run, shift, config, console, trained_layout)
+    return {shift: measured[shift] for shift in shifts}
 
 
 def _check(run: Run, reference_run: Run | None, config: ReportConfig) -> None:

@@ -13,7 +13,7 @@ from jaxnav.experiments.gap_traces import GapTraces, trace_gaps
 from jaxnav.experiments.similarity import SuccessBySimilarity, compute_similarity_points, relate_success_to_similarity
 from jaxnav.progress import show_activity
 from jaxnav.report.config import ReportConfig
-from jaxnav.report.replays import ReplayAgent, Replays, make_replays
+from jaxnav.report.replays import ReplayAgent, Replays, TrainedLayout, make_replays
 from jaxnav.runs.evaluate import Results, evaluate, measure_leads
 from jaxnav.runs.policies import Policies
 from jaxnav.runs.run import Run
@@ -33,6 +33,7 @@ class ShiftMeasurements(NamedTuple):
       similarity: success by layout similarity; None if scenes are streamed.
       gaps: layout gap along the episodes; None if scenes are streamed, or without the layout.
       replays: episodes, step by step.
+      world: compiled scenes.
     """
 
     results: Results
@@ -40,10 +41,16 @@ class ShiftMeasurements(NamedTuple):
     similarity: SuccessBySimilarity | None
     gaps: GapTraces | None
     replays: Replays
+    world: CompiledWorld
 
 
 def measure_shift(
-    run: Run, reference_run: Run | None, shift: float, config: ReportConfig, console: Console
+    run: Run,
+    reference_run: Run | None,
+    shift: float,
+    config: ReportConfig,
+    console: Console,
+    trained_layout: TrainedLayout | None = None,
 ) -> ShiftMeasurements:
     """Measure a run at one layout shift.
 
@@ -53,6 +60,7 @@ def measure_shift(
       shift: layout shift.
       config: options of the measurements.
       console: receives messages about the progress.
+      trained_layout: layout of training, in which the replayed episodes are played, too; None for none.
 
     Raises:
       InputError: no finished run, an impossible option, or runs that cannot be compared.
@@ -102,8 +110,8 @@ def measure_shift(
     # The number of replays is that of the whole page.
     replays_per_shift = config.replays // len(set(config.shift))
     with show_activity(console, f"playing episodes for the replays at shift {shift:g}"):
-        replays = make_replays(agents, episodes, replays_per_shift, shift, config.split)
-    return ShiftMeasurements(results, account, similarity, gap_traces, replays)
+        replays = make_replays(agents, episodes, replays_per_shift, shift, config.split, trained_layout)
+    return ShiftMeasurements(results, account, similarity, gap_traces, replays, world)
 
 
 def _evaluate(run: Run, shift: float, world: CompiledWorld, config: ReportConfig, console: Console) -> Results:

@@ -8,28 +8,31 @@ const shown = () => shifts[state.shift];
 const current = () => shown().episodes[state.episode];
 const lasting = () => Math.max(...state.players.map((player) => current().courses[player].actions.length));
 
+const layoutName = (shift) => (shift ? `layout shift ${shift}` : "layout as trained");
+
 // One side: an agent in the present episode.
 
 function makeSide(number) {
-  const { players, thresholds, plans, categories } = shown(), episode = current(), plan = plans[episode.plan];
-  const player = state.players[number], course = episode.courses[player];
+  const { players, layouts, thresholds, plans, categories } = shown(), episode = current();
+  const player = state.players[number], course = episode.courses[player], plan = plans[course.plan];
   const [gap, weight, layout, chances] = [course.gap, course.weight, course.layout, course.chances].map(unpack);
-  const { drawing, unit, labels } = drawPlan(plan, categories, episode.goal);
+  const { drawing, unit, labels, heat } = drawPlan(plan, categories, episode.goal);
+  const belief = course.belief && unpack(course.belief.shares);
   const moving = shape("g"), doing = element("span"), level = element("span"), cursor = shape("line", { class: "cursor" });
-  const [actions, seen, layouts] = [0, 1, 2].map(() => element("div", { className: "bars" }));
+  const [actions, seen, expected] = [0, 1, 2].map(() => element("div", { className: "bars" }));
   const choice = element("select", { ariaLabel: number ? "Right agent" : "Left agent" },
     ...players.map((name, i) => element("option", { value: i, selected: i === player }, name)));
   choice.addEventListener("change", () => { state.players[number] = Number(choice.value); show(); });
   drawing.append(moving);
   const key = element("span", { className: "key" },
-    ...KINDS.map((kind, i) => element("b", { style: `color: var(--${["blue", "pale", "orange"][i]})` }, kind)));
+    ...KINDS.map((kind, i) => element("b", { style: `color: var(--${["blue", "pale", "orange"][i]})` }, term(kind, ["factual", "factual", "stde"][i]))));
   const root = element("article", { className: "side" }, choice,
-    element("p", { className: "status" }, doing, ending(course)), drawing,
-    element("h3", {}, "Layout gap", level), drawCourse(gap, weight, thresholds[player], cursor, lasting()),
+    element("p", { className: "status" }, doing, element("span", {}, layoutName(layouts[player])), ending(course)), drawing,
+    element("h3", {}, term("Layout gap", "gap"), level), drawCourse(gap, weight, thresholds[player], cursor, lasting()),
     element("h3", {}, "Action", key), actions,
     element("div", { className: "pair" },
       element("div", {}, element("h3", {}, "Detected now"), seen),
-      element("div", {}, element("h3", {}, "Goal expected near"), layouts)));
+      element("div", {}, element("h3", {}, term("Goal expected near", "weights")), expected)));
 
   function update(step) {
     const at = Math.min(step, course.actions.length - 1), view = plan.views[course.views[at]];
@@ -40,6 +43,7 @@ function makeSide(number) {
       shape("circle", { class: "start", cx: sx, cy: sy, r: unit, "stroke-width": 0.4 * unit }),
       shape("text", { class: "label", x: Number(sx) + 1.6 * unit, y: Number(sy) + 3.2 * unit }, at ? "start" : ""),
       ...drawView(view, shown(), categories, unit, episode.goal, labels));
+    if (belief) heat.replaceChildren(...drawBelief(course.belief, belief, at));
     const action = course.actions[at], ended = step >= course.actions.length;
     doing.textContent = ended ? `ended at step ${at + 1}` : `step ${at + 1}: ${ACTIONS[action]}`;
     level.textContent = `D ${gap[at].toFixed(2)}, removed share ${weight[at].toFixed(2)}`;
@@ -52,7 +56,7 @@ function makeSide(number) {
     list(seen, view.seen.map(([category, , , sure]) => [sure / 100, category]), 1, "no detections");
     const weights = Array.from(layout.slice(at * categories.length, (at + 1) * categories.length), (w, i) => [w, i]);
     const otherWeights = weights.filter(([w, i]) => w > 0 && i !== episode.goal).sort((a, b) => b[0] - a[0]);
-    list(layouts, otherWeights, otherWeights.length ? otherWeights[0][0] : 1, "no layout weights");
+    list(expected, otherWeights, otherWeights.length ? otherWeights[0][0] : 1, "no layout weights");
   }
   function list(where, shares, whole, none) {
     const bars = shares.slice(0, MOST).flatMap(([share, category]) =>
@@ -76,8 +80,12 @@ function order() {
 function listEpisodes() {
   const { episodes, plans, categories, differ, evaluated, players, split } = shown();
   const [left, right] = state.players, whole = evaluated.toLocaleString("en");
-  part("count").textContent = left === right ? `${episodes.length} of ${whole} ${split} episodes can be replayed.`
-    : `“${players[left]}” and “${players[right]}” differ in success or in the number of actions in ${differ[left][right]} `
+  const count = differ[left][right];
+  part("count").textContent = left !== right && count === null
+    ? `“${players[left]}” and “${players[right]}” act in different layouts of the same homes, with equal goals and starts. `
+      + `${episodes.length} episodes can be replayed; those with a difference come first.`
+    : left === right ? `${episodes.length} of ${whole} ${split} episodes can be replayed.`
+    : `“${players[left]}” and “${players[right]}” differ in success or in the number of actions in ${count} `
       + `of ${whole} episodes (${split}). ${episodes.length} episodes can be replayed; those with a difference come first.`;
   part("episodes").replaceChildren(...order().map((index) => {
     const episode = episodes[index], button = element("button", { type: "button" },
@@ -92,6 +100,7 @@ function listEpisodes() {
 let sides = [];
 
 function show() {
+  part("heat").hidden = !current().courses.some((course) => course.belief);
   const number = shown().players.length > 1 ? 2 : 1, list = part("episodes"), { scrollTop } = list;
   drawTabs();
   sides = Array.from({ length: number }, (_, i) => makeSide(i));

@@ -24,6 +24,7 @@ from jaxnav.env.render import (
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.playback import EpisodeTrace
 from jaxnav.evaluation.variants import EvaluationRow
+from jaxnav.report.beliefs import SQUARE_SIZE, BeliefTracer, find_squares
 from jaxnav.runs.evaluate import find_scene, replay_episodes
 from jaxnav.runs.policies import Policies
 from jaxnav.runs.worlds import CompiledWorld
@@ -41,6 +42,10 @@ ROLE_PAIRS = {
     "Experience": ("layout", "reference"),
     "Layout weights": ("layout", "baseline"),
 }
+#: Pair of one agent in two layouts of the same home.
+LAYOUT_PAIR = "Layout"
+#: Episodes that are played in both layouts for each episode that is shown.
+_LAYOUT_CANDIDATES = 4
 
 Rectangle = tuple[int, int, int, int]
 
@@ -69,6 +74,18 @@ class ReplayAgent(NamedTuple):
     def differs(self, other: "ReplayAgent") -> np.ndarray:
         """Return in which episodes the other agent has another result or length, bool [E]."""
         return (self.success != other.success) | (self.length != other.length)
+
+
+class TrainedLayout(NamedTuple):
+    """Scenes in the layout of training, in which episodes of shifted scenes are played once more.
+
+    Attributes:
+      shift: layout shift of training.
+      world: compiled scenes.
+    """
+
+    shift: float
+    world: CompiledWorld
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,10 +141,30 @@ class ScenePlan:
 
 
 @dataclasses.dataclass(frozen=True)
+class BeliefFrames:
+    """Beliefs of a search at U choices of a target, as heat maps of squares.
+
+    Attributes:
+      steps: [U], steps of the choices.
+      corner: x and z of the lowest corner of the first square.
+      side: length of a side of a square.
+      columns: number of squares along x.
+      shares: packed [U, rows, columns], probability of the goal in each square, as shares of the likeliest square.
+    """
+
+    steps: list[int]
+    corner: tuple[int, int]
+    side: int
+    columns: int
+    shares: str
+
+
+@dataclasses.dataclass(frozen=True)
 class ReplayTrace:
     """Episode of T steps as one agent plays it, with K categories and A actions.
 
     Attributes:
+      plan: index of the plan in which the agent acts.
       views: [T], indices into the plan's views.
       actions: [T], actions.
       success: True if the episode ended with Done where Done succeeds.
@@ -136,8 +173,10 @@ class ReplayTrace:
       layout: packed [T, K], weights towards the goal (eq. 7), at most 1; empty without the layout.
       chances: packed [T, 3, A], probabilities by the factual, the counterfactual and the corrected logits; empty
         where the policy chooses no actions.
+      belief: belief over places; None for methods other than a search by belief.
     """
 
+    plan: int
     views: list[int]
     actions: list[int]
     success: bool
@@ -145,6 +184,7 @@ class ReplayTrace:
     weight: str
     layout: str
     chances: str
+    belief: BeliefFrames | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -152,7 +192,7 @@ class ReplayEpisode:
     """Episode of the replays.
 
     Attributes:
-      plan: index of the plan of its scene.
+      plan: index of the plan of its scene, at the layout shift of the replays.
       goal: index of the category to search for.
       best: length L* of a shortest path, actions.
       courses: trace of each agent.
@@ -173,9 +213,11 @@ class Replays:
       split: split of the scenes.
       categories: names of the categories.
       players: names of the agents, as in tables.
+      layouts: layout shift of the scenes of each agent.
       comparisons: pairs of agents by the difference between them; the page shows the first pair.
       thresholds: threshold of sTDE of each agent; None where nothing is removed.
-      differ: [P, P], number of evaluated episodes in which two agents differ in result or length.
+      differ: [P, P], number of evaluated episodes in which two agents differ in result or length; None for an agent in
+        the layout of training, which plays fewer episodes.
       evaluated: number of evaluated episodes.
       field_of_view: horizontal field of view, degrees.
       reach: length of the view cone, centimetres.
@@ -187,9 +229,10 @@ class Replays:
     split: str
     categories: list[str]
     players: list[str]
+    layouts: list[float]
     comparisons: dict[str, tuple[int, int]]
     thresholds: list[float | None]
-    differ: list[list[int]]
+    differ: list[list[int | None]]
     evaluated: int
     field_of_view: float
     reach: int
@@ -197,7 +240,14 @@ class Replays:
     episodes: list[ReplayEpisode]
 
 
-def make_replays(agents: Sequence[ReplayAgent], episodes: EpisodeList, count: int, shift: float, split: str) -> Replays:
+def make_replays(
+    agents: Sequence[ReplayAgent],
+    episodes: EpisodeList,
+    count: int,
+    shift: float,
+    split: str,
+    trained_layout: TrainedLayout | None = None,
+) -> Replays:
     """Choose episodes of an evaluation and play them with every agent.
 
     Args:
@@ -206,60 +256,176 @@ def make_replays(agents: Sequence[ReplayAgent], episodes: EpisodeList, count: in
       count: number of episodes to replay.
       shift: layout shift of the scenes.
       split: split of the scenes.
+      trained_layout: layout in which the agent that keeps its experience plays the episodes, too; None for none.
     """
     world = agents[0].world
     bank = world.banks[0]
+    comparisons = pair_agents(agents)
+    players = [agent.name for agent in agents]
+    thresholds = [agent.row.epsilon for agent in agents]
+    differ: list[list[int | None]] = [_count_differing_episodes(agent, agents) for agent in agents]
+    rows = [agent.row for agent in agents]
+    tracers = _make_tracers(agents)
 
     # Play the selected episodes again, because the evaluation stores results, not traces.
-    selected_episodes = episodes.take(select_episodes(agents, count))
+    main_index = _find_main_agent(agents)
+    main_agent = agents[main_index]
+    selected_indices = select_episodes(agents, count)
+    trained_traces = None
+    if trained_layout is not None:
+        selected_indices, trained_traces = _play_in_layout(agents, main_agent, trained_layout, episodes, count)
+    selected_episodes = episodes.take(selected_indices)
     traces_by_agent = []
     for agent in agents:
         traces_by_agent.append(replay_episodes(agent.policies, agent.world, selected_episodes, agent.row))
 
-    # One plan for each scene, with a view from every pose that any agent visits there.
-    scenes = np.unique(selected_episodes.scene)
-    scene_plans = []
+    # The agent in the layout of training is one more player, and the only one in other scenes.
+    layout_worlds = [world]
+    layout_of_player = [0] * len(agents)
+    layout_shifts = [shift] * len(agents)
+    if trained_layout is not None and trained_traces is not None:
+        comparisons[LAYOUT_PAIR] = (len(players), main_index)
+        players.append(f"{main_agent.name}, shift {trained_layout.shift:g}")
+        thresholds.append(main_agent.row.epsilon)
+        traces_by_agent.append(trained_traces)
+        rows.append(main_agent.row)
+        tracers.append(tracers[main_index])
+        layout_worlds.append(trained_layout.world)
+        layout_of_player.append(1)
+        layout_shifts.append(trained_layout.shift)
+        for counts in differ:
+            counts.append(None)
+        differ.append([None] * len(players))
+
+    # One plan for each scene and layout, with a view from every pose that any agent visits there.
+    scene_plans: list[ScenePlan] = []
+    plan_index: dict[tuple[int, int], int] = {}
     poses_by_plan = []
-    for scene in scenes:
-        episodes_in_scene = np.flatnonzero(selected_episodes.scene == scene)
-        visited_poses = []
-        for traces in traces_by_agent:
-            for episode_index in episodes_in_scene:
-                visited_poses.append(traces[episode_index].pose)
-        poses = np.unique(np.concatenate(visited_poses))
-        poses_by_plan.append(poses)
-        scene_plans.append(make_plan(find_scene(world, bank.names[scene]), bank, scene, poses))
+    for layout, layout_world in enumerate(layout_worlds):
+        for scene in np.unique(selected_episodes.scene).tolist():
+            visited_poses = []
+            for player_layout, traces in zip(layout_of_player, traces_by_agent, strict=True):
+                if player_layout == layout:
+                    for episode_index in np.flatnonzero(selected_episodes.scene == scene):
+                        visited_poses.append(traces[episode_index].pose)
+            poses = np.unique(np.concatenate(visited_poses))
+            plan_index[layout, scene] = len(scene_plans)
+            poses_by_plan.append(poses)
+            plan_scene = find_scene(layout_world, layout_world.banks[0].names[scene])
+            scene_plans.append(make_plan(plan_scene, layout_world.banks[0], scene, poses))
 
     # One trace for each episode and agent.
-    plan_of_episode = np.searchsorted(scenes, selected_episodes.scene)
     replay_episode_list = []
     for episode_index in range(len(selected_episodes.goal)):
-        plan = int(plan_of_episode[episode_index])
+        scene = int(selected_episodes.scene[episode_index])
+        goal = int(selected_episodes.goal[episode_index])
         courses = []
-        for agent, traces in zip(agents, traces_by_agent, strict=True):
-            courses.append(
-                _make_trace(traces[episode_index], poses_by_plan[plan], has_layout=agent.row.arm == "layout")
-            )
+        for layout, row, tracer, traces in zip(layout_of_player, rows, tracers, traces_by_agent, strict=True):
+            plan = plan_index[layout, scene]
+            trace = traces[episode_index]
+            course = _make_trace(trace, plan, poses_by_plan[plan], has_layout=row.arm == "layout")
+            if tracer is not None:
+                frames = _make_belief_frames(tracer, trace, layout_worlds[layout], scene, goal)
+                course = dataclasses.replace(course, belief=frames)
+            courses.append(course)
         best_length = int(selected_episodes.best_length[episode_index])
-        replay_episode_list.append(
-            ReplayEpisode(plan, int(selected_episodes.goal[episode_index]), best_length, courses)
-        )
+        replay_episode_list.append(ReplayEpisode(plan_index[0, scene], goal, best_length, courses))
 
     # Names, thresholds and differences stand in the order of the agents.
     return Replays(
         shift=shift,
         split=split,
         categories=list(bank.task.categories),
-        players=[agent.name for agent in agents],
-        comparisons=pair_agents(agents),
-        thresholds=[agent.row.epsilon for agent in agents],
-        differ=[_count_differing_episodes(agent, agents) for agent in agents],
+        players=players,
+        layouts=layout_shifts,
+        comparisons=comparisons,
+        thresholds=thresholds,
+        differ=differ,
         evaluated=len(episodes.goal),
         field_of_view=bank.task.rules.field_of_view[0],
         reach=round(100 * MAX_RANGE),
         plans=scene_plans,
         episodes=replay_episode_list,
     )
+
+
+def _make_tracers(agents: Sequence[ReplayAgent]) -> list[BeliefTracer | None]:
+    """Return the tracer of the belief of each agent; None for agents without one."""
+    # Agents of one run share a tracer, because a tracer compiles a program.
+    tracer_of_policies: dict[int, BeliefTracer] = {}
+    tracers: list[BeliefTracer | None] = []
+    for agent in agents:
+        if agent.row.arm == "layout" and BeliefTracer.supports(agent.policies):
+            key = id(agent.policies)
+            if key not in tracer_of_policies:
+                tracer_of_policies[key] = BeliefTracer(agent.policies)
+            tracers.append(tracer_of_policies[key])
+        else:
+            tracers.append(None)
+    return tracers
+
+
+def _make_belief_frames(
+    tracer: BeliefTracer, trace: EpisodeTrace, world: CompiledWorld, scene_index: int, goal: int
+) -> BeliefFrames:
+    """Return the beliefs of an episode as data of the page."""
+    bank = world.banks[0]
+    steps, beliefs = tracer.compute(trace, bank, goal)
+
+    # Squares that cover the home; the map begins at the start of the episode.
+    scene = find_scene(world, bank.names[scene_index])
+    first_cell, _, _ = bank.task.rules.split_pose(int(trace.pose[0]))
+    start = cell_centres(scene, standable_cells(scene.reach))[first_cell - bank.first_cell[scene_index]]
+    grid = find_squares(scene, start, beliefs.shape[-1])
+    shown_beliefs = beliefs[:, grid.rows[:, None], grid.columns]
+
+    largest = shown_beliefs.max(axis=(1, 2), keepdims=True)
+    x, z = _to_centimetres(grid.low_corner).tolist()
+    return BeliefFrames(
+        steps=steps.tolist(),
+        corner=(x, z),
+        side=round(100 * SQUARE_SIZE),
+        columns=len(grid.columns),
+        shares=pack_shares(shown_beliefs / np.maximum(largest, np.finfo(np.float32).tiny)),
+    )
+
+
+def _find_main_agent(agents: Sequence[ReplayAgent]) -> int:
+    """Return the index of the agent that keeps its experience, or of the first agent."""
+    for index, agent in enumerate(agents):
+        if agent.role == "layout":
+            return index
+    return 0
+
+
+def _play_in_layout(
+    agents: Sequence[ReplayAgent], agent: ReplayAgent, layout: TrainedLayout, episodes: EpisodeList, count: int
+) -> tuple[np.ndarray, list[EpisodeTrace] | None]:
+    """Select episodes, and play them with one agent in another layout.
+
+    Rooms, goals and starts are equal in both layouts. Up to half of the episodes are those in which only one layout
+    lets the agent succeed; the order is that of `select_episodes`.
+
+    Returns:
+      Indices of the episodes, and their traces; None if no goal can be reached in the other layout.
+    """
+    # Objects lie at other places, so that a goal may be out of reach; 0 is no length.
+    candidates = select_episodes(agents, len(episodes.goal))
+    lengths = layout.world.banks[0].best_length[episodes.pose[candidates], episodes.goal[candidates]]
+    candidates = candidates[lengths > 0][: _LAYOUT_CANDIDATES * count]
+    if len(candidates) == 0:
+        return select_episodes(agents, count), None
+
+    traces = replay_episodes(agent.policies, layout.world, episodes.take(candidates), agent.row)
+    has_other_result = np.zeros(len(candidates), bool)
+    for index, trace in enumerate(traces):
+        has_other_result[index] = trace.success != agent.success[candidates[index]]
+
+    # Take the first episodes with another result, fill up with the first of the list, and restore the order.
+    first_indices = np.flatnonzero(has_other_result)[: (count + 1) // 2]
+    remaining_indices = np.setdiff1d(np.arange(len(candidates)), first_indices)
+    selected = np.sort(np.concatenate([first_indices, remaining_indices[: count - len(first_indices)]]))
+    return candidates[selected], [traces[index] for index in selected]
 
 
 def select_episodes(agents: Sequence[ReplayAgent], count: int) -> np.ndarray:
@@ -297,15 +463,16 @@ def pair_agents(agents: Sequence[ReplayAgent]) -> dict[str, tuple[int, int]]:
     return role_pairs
 
 
-def _count_differing_episodes(agent: ReplayAgent, others: Sequence[ReplayAgent]) -> list[int]:
+def _count_differing_episodes(agent: ReplayAgent, others: Sequence[ReplayAgent]) -> list[int | None]:
     return [int(agent.differs(other).sum()) for other in others]
 
 
-def _make_trace(trace: EpisodeTrace, plan_poses: np.ndarray, has_layout: bool) -> ReplayTrace:
+def _make_trace(trace: EpisodeTrace, plan: int, plan_poses: np.ndarray, has_layout: bool) -> ReplayTrace:
     """Return a trace as data of the page.
 
     Args:
       trace: trace of an episode.
+      plan: index of the plan.
       plan_poses: sorted poses of the views of the plan.
       has_layout: True for agents with layout weights.
     """
@@ -316,6 +483,7 @@ def _make_trace(trace: EpisodeTrace, plan_poses: np.ndarray, has_layout: bool) -
     # Policies that choose among other things than actions have no probabilities to show.
     chooses_actions = logits.shape[-1] == NUM_ACTIONS
     return ReplayTrace(
+        plan=plan,
         views=np.searchsorted(plan_poses, trace.pose).tolist(),
         actions=trace.action.tolist(),
         success=trace.success,

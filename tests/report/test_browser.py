@@ -25,6 +25,7 @@ const read = () => seen.push({
   now: document.getElementById("now").textContent,
   agents: by(".plan .agent").map((agent) => agent.getAttribute("transform")),
   labels: by(".side:first-child .plan .label").map((label) => label.textContent).filter(Boolean),
+  heat: by(".heat .square").map((square) => [Number(square.getAttribute("x")), Number(square.getAttribute("y"))]),
   cursors: by(".cursor").map((cursor) => Number(cursor.getAttribute("x1"))),
 });
 const section = document.getElementById("replays"), slider = document.getElementById("step");
@@ -117,6 +118,14 @@ def test_plan_names_the_goal_and_objects_and_shows_start_and_scale(verdict):
     assert labels[0] == goal
     assert {"1 m", "start"} <= set(labels)
     assert set(labels) - {"1 m", "start"} <= categories_in_plan
+
+
+def test_heat_map_shows_the_latest_belief(verdict):
+    """Squares of 50 cm from (-12, -12), row by row along z; y is -z at the far side of a square."""
+    first_belief = [[-12, -38], [38, -38]]
+    second_belief = [[88, -38], [-12, -88], [38, -88], [88, -88]]
+    heat_maps = [state["heat"] for state in verdict["seen"][:5]]
+    assert heat_maps == [[], first_belief, first_belief, second_belief, second_belief]
 
 
 def test_keys_step_and_change_the_episode(verdict):

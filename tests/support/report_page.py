@@ -7,7 +7,7 @@ import numpy as np
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.report.headline import Headline, KeyFigure
 from jaxnav.report.page import Chart, Section, TextTable, render_page
-from jaxnav.report.replays import ReplayEpisode, Replays, ReplayTrace, make_plan, pack_shares
+from jaxnav.report.replays import BeliefFrames, ReplayEpisode, Replays, ReplayTrace, make_plan, pack_shares
 from jaxnav.scenes.task import DONE, NUM_ACTIONS
 from support import tiny_world as tiny
 
@@ -23,6 +23,7 @@ def trace_through(views, success=True):
     probabilities[:, :, 0] = 0.5
     layout_weights = np.tile(np.linspace(0, 0.9, NUM_CATEGORIES), (num_steps, 1))
     return ReplayTrace(
+        plan=0,
         views=list(views),
         actions=[0] * (num_steps - 1) + [DONE],
         success=success,
@@ -37,12 +38,16 @@ def example_replays(suffix=""):
     """Replays in which every name ends with `suffix`; the agents differ in the second episode."""
     scene = dataclasses.replace(tiny.KITCHEN, name=tiny.KITCHEN.name + suffix)
     short_trace = trace_through([0, 1, 2])
-    long_trace = trace_through([0, 1, 2, 3, 2], success=False)
+    # A belief over two by three squares, which is computed at two steps.
+    beliefs = np.array([[[1.0, 0.5, 0.0], [0.0, 0.0, 0.0]], [[0.0, 0.0, 1.0], [0.2, 0.4, 0.6]]])
+    frames = BeliefFrames(steps=[1, 3], corner=(-12, -12), side=50, columns=3, shares=pack_shares(beliefs))
+    long_trace = dataclasses.replace(trace_through([0, 1, 2, 3, 2], success=False), belief=frames)
     return Replays(
         shift=0.0,
         split="val",
         categories=[category + suffix for category in tiny.CATEGORIES],
         players=["layout" + suffix, "removed" + suffix],
+        layouts=[0.0, 0.0],
         comparisons={"Removal" + suffix: (0, 1), "Other" + suffix: (1, 0)},
         thresholds=[None, 0.5],
         differ=[[0, 7], [7, 0]],
