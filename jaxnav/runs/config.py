@@ -408,6 +408,8 @@ _MAX_VALUES = {
 }
 #: Upper bound of every whole number in the groups `worlds`, `layout`, `sizes` and `ppo`.
 _MAX_GROUP_VALUE = 10**6
+#: Upper bound of every other number in these groups and `detector`, near the largest float32.
+_MAX_FLOAT = 3.4e38
 #: Upper bound of environment steps that are held in memory at once.
 _MAX_STEPS_IN_MEMORY = 2**28
 _MAX_CHUNKS = 4 * 10**6
@@ -531,9 +533,11 @@ def _check_numbers(config: RunConfig) -> None:
         _require(value is None or value <= max_value, name, value, f"give at most {max_value:,}")
 
     if config.devices is not None:
-        from jaxnav.training.devices import Devices
+        from jaxnav.training.devices import MAX_DEVICES, Devices
 
-        accepted_forms = "give a number, `cluster` or HOST:PORT,INDEX,PROCESSES with INDEX from 0"
+        accepted_forms = (
+            f"give a number, `cluster` or HOST:PORT,INDEX,PROCESSES with INDEX from 0; at most {MAX_DEVICES:,} of each"
+        )
         _require(Devices.parse(str(config.devices)) is not None, "devices", repr(config.devices), accepted_forms)
 
     # NumPy's generators take seeds of 32 bits.
@@ -550,6 +554,15 @@ def _check_numbers(config: RunConfig) -> None:
                 name = f"{group_name}.{config_field.name}"
                 _require(value >= 1, name, value, "give at least 1")
                 _require(value <= _MAX_GROUP_VALUE, name, value, f"give at most {_MAX_GROUP_VALUE:,}")
+
+    # Larger numbers would become infinite in the networks.
+    for group_name in ("worlds", "detector", "layout", "ppo"):
+        group = getattr(config, group_name)
+        for config_field in dataclasses.fields(group):
+            value = getattr(group, config_field.name)
+            if isinstance(value, float) and math.isfinite(value):
+                name = f"{group_name}.{config_field.name}"
+                _require(abs(value) <= _MAX_FLOAT, name, value, f"give at most {_MAX_FLOAT:g}")
 
     # Products of settings that decide about memory and the length of the schedule.
     step_products = {

@@ -34,6 +34,10 @@ from jaxnav.training.shares import ENV_AXIS, SEED_AXIS
 
 Tree = TypeVar("Tree")
 
+#: Upper bound of the numbers of devices and processes.
+MAX_DEVICES = 10**6
+#: Largest port of a network address.
+_MAX_PORT = 2**16 - 1
 #: Seconds after which a process that does not connect, or does not respond, counts as lost.
 TIMEOUT_SECONDS = 30
 
@@ -63,11 +67,12 @@ class Devices:
         """Parse `COUNT`, `cluster` or `HOST:PORT,INDEX,PROCESSES`; None if the text is none of these."""
         if text == "cluster":
             return cls()
-        if re.fullmatch(r"[1-9]\d*", text):
+        # Python converts no text of several thousand digits.
+        if re.fullmatch(r"[1-9]\d{0,6}", text) and int(text) <= MAX_DEVICES:
             return cls(count=int(text))
-        match = re.fullmatch(r"(.+:\d+),(\d+),(\d+)", text)
-        if match and int(match[2]) < int(match[3]):
-            return cls(address=match[1], process=int(match[2]), processes=int(match[3]))
+        match = re.fullmatch(r"(.+:(\d{1,5})),(\d{1,7}),(\d{1,7})", text)
+        if match and int(match[2]) <= _MAX_PORT and int(match[3]) < int(match[4]) <= MAX_DEVICES:
+            return cls(address=match[1], process=int(match[3]), processes=int(match[4]))
         return None
 
     def connect(self) -> None:

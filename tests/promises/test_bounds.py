@@ -5,14 +5,18 @@ episodes, a console that does not know `MemoryError`, a `jaxnav` that does not k
 """
 
 import bz2
+import dataclasses
 import errno
+import functools
 import gzip
 import json
 import os
 import subprocess
 import sys
 import tracemalloc
+import typing
 
+import numpy as np
 import pytest
 from support.commands import train
 from support.fuzz import KINDS, fuzz
@@ -24,6 +28,8 @@ from support.tiny_world import BANK
 from jaxnav.cli.console import run_command
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import MAX_EPISODES, draw_episodes
+from jaxnav.runs.config import RunConfig, check_config
+from jaxnav.runs.config_files import apply_yaml
 from jaxnav.scenes.files.importers.pickled_arrays import read_pickle
 from jaxnav.scenes.files.scene_file import max_decompressed_size, read_bytes
 
@@ -90,6 +96,50 @@ def test_train_caps_every_size_before_writing(tmp_path, capsys, option):
     assert_message_names(message, f"{field_name} is {value}", "give at most ")
     assert message.count("\n") == 1
     assert not (tmp_path / "run").exists()
+
+
+# Numbers in settings
+
+
+def list_numeric_settings(group_class, prefix=""):
+    """Yield the name and type of every setting that holds a number, nested groups included."""
+    types = typing.get_type_hints(group_class)
+    for field in dataclasses.fields(group_class):
+        field_type = types[field.name]
+        if dataclasses.is_dataclass(field_type):
+            yield from list_numeric_settings(field_type, f"{prefix}{field.name}.")
+        elif {int, float} & {field_type, *typing.get_args(field_type)}:
+            yield prefix + field.name, field_type
+
+
+ABSURD_NUMBERS = ("1" + 23 * "0", "-1" + 23 * "0", "1" + 400 * "0", "1" + 5000 * "0", "1.0e+308")
+
+
+@pytest.mark.parametrize(("name", "field_type"), list(list_numeric_settings(RunConfig)))
+def test_absurd_numbers_are_refused_in_one_line(name, field_type, tmp_path):
+    is_float = float in (field_type, *typing.get_args(field_type))
+    for number in ABSURD_NUMBERS:
+        # Write the number into its groups, such as `{ppo: {clip: 1.0e+308}}`.
+        text = number
+        for part in reversed(name.split(".")):
+            text = f"{{{part}: {text}}}"
+        (tmp_path / "a.yaml").write_text(text)
+
+        message = None
+        config = RunConfig(run_dir=tmp_path / "run")
+        try:
+            config = check_config(apply_yaml(config, tmp_path / "a.yaml"))
+        except InputError as error:
+            message = str(error)
+
+        # Only numbers that are no counts may be so large, and they stay finite in the networks.
+        if message is None:
+            assert is_float
+            assert np.isfinite(np.float32(functools.reduce(getattr, name.split("."), config)))
+        else:
+            # YAML itself reads no number of several thousand digits.
+            assert_message_names(message, name.rpartition(".")[2] if len(number) < 4000 else "a.yaml: not valid YAML")
+            assert "\n" not in message
 
 
 def test_products_of_sizes_are_capped(tmp_path, capsys):

@@ -127,7 +127,10 @@ def test_devices_are_read(text, devices):
     assert Devices.parse(text) == devices
 
 
-@pytest.mark.parametrize("text", ["0", "-1", "two", "host:1,2,2", "host,0,2", "host:1,0", ""])
+@pytest.mark.parametrize(
+    "text",
+    ["0", "-1", "two", "host:1,2,2", "host,0,2", "host:1,0", "", "1000001", "host:65536,0,2", "host:1,0,1000001"],
+)
 def test_other_devices_are_refused(text, tmp_path, capsys):
     assert train(write_config(tmp_path), tmp_path / "run", f"--devices={text}") == 2
     message = refusal(capsys).replace("'", "")  # what reads as a number is not quoted
