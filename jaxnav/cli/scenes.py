@@ -37,7 +37,7 @@ class ImportConfig:
         `habitat`: an ObjectNav split or one of its files. `replacements`: places of movable objects in the rooms of
         `--base`. `scenes`: a scene file, to divide it into splits.
       source: file or folder to read; with `--from-controller`, names of scenes, separated by commas.
-      out: scene file to write (`*.jsonl.gz`).
+      out: scene file to write (`*.jsonl.gz`). A file with other scenes is never replaced.
       split: split of the scenes that match none of the patterns `--val` and `--test`.
       val: patterns of scene names, such as `FloorPlan_Val1_*`, that become the split val.
       test: patterns of scene names that become the split test.

@@ -71,6 +71,7 @@ def test_import_selects_homes_by_room_type_and_size(tmp_path, capsys):
     kitchen = build(("Kitchen", [(0, 0), (0, 3), (3, 3), (3, 0)]), objects=(table,))
     source = write_lines(tmp_path / "houses.jsonl", HOUSE, HOUSE, kitchen)
     target = tmp_path / "scenes.jsonl.gz"
+    kitchen_target = tmp_path / "kitchens.jsonl.gz"
 
     # A house is 6 m by 3 m: 25 lattice points from wall to wall, and a cell beyond at either end.
     assert import_scenes("procthor", source, target, "--room-types", "house", "--largest", "27") == 0
@@ -79,8 +80,8 @@ def test_import_selects_homes_by_room_type_and_size(tmp_path, capsys):
     assert_message_names(output, "1 scenes are skipped", "room type", "house\n")
     assert "2 scenes imported, 0 refused" in output
 
-    assert import_scenes("procthor", source, target, "--room-types", "kitchen") == 0
-    assert [scene.name for scene in read_scenes(target)] == ["houses-2"]
+    assert import_scenes("procthor", source, kitchen_target, "--room-types", "kitchen") == 0
+    assert [scene.name for scene in read_scenes(kitchen_target)] == ["houses-2"]
 
 
 # What an import reports
@@ -121,7 +122,7 @@ def test_import_counts_unconnected_cells(tmp_path, capsys):
     assert "guessed" not in output
 
     # The agent stands in the smaller room.
-    assert import_scenes("procthor", source, target, "--assets", assets_file, "--agent-part") == 0
+    assert import_scenes("procthor", source, tmp_path / "part.jsonl.gz", "--assets", assets_file, "--agent-part") == 0
     output = capsys.readouterr().err
     assert_message_names(output, "121 cells are skipped")
     assert "largest" not in output
@@ -161,6 +162,33 @@ def test_import_skips_bad_lines_of_a_scene_file(tmp_path, capsys):
 
 
 # Refusals
+
+
+def test_import_repeats_itself_and_replaces_no_other_scenes(tmp_path, capsys):
+    source = write_lines(tmp_path / "rooms.jsonl", METADATA, METADATA | {"sceneName": "FloorPlan2"})
+    target = tmp_path / "scenes.jsonl.gz"
+    assert import_scenes("ai2thor", source, target) == 0
+    content = target.read_bytes()
+
+    # The same import again, also over a file that another program has compressed.
+    target.write_bytes(gzip.compress(gzip.decompress(content), compresslevel=1))
+    assert import_scenes("ai2thor", source, target) == 0
+    assert target.read_bytes() == content
+
+    # Other splits, an account of other objects, the scenes alone, a file of another kind, and a damaged file.
+    options_and_files = (
+        (("--split", "val"), content),
+        ((), gzip.compress(gzip.decompress(content).replace(b"objects", b"goals", 1))),
+        ((), gzip.compress(b"".join(gzip.decompress(content).splitlines(keepends=True)[1:]))),
+        ((), b"a file of my own"),
+        ((), content[:-9]),
+    )
+    capsys.readouterr()
+    for options, earlier_content in options_and_files:
+        target.write_bytes(earlier_content)
+        assert import_scenes("ai2thor", source, target, *options) == 2
+        assert str(target) in refusal(capsys)
+        assert target.read_bytes() == earlier_content
 
 
 @pytest.mark.parametrize(

@@ -181,7 +181,7 @@ def import_scenes(
     categories: tuple[str, ...] | None = None,
     report: Callable[[InputError], None] = print,
 ) -> ImportSummary:
-    """Write usable scenes to a scene file.
+    """Write usable scenes to a scene file, unless it exists with other content.
 
     Args:
       scenes: see `read_source`.
@@ -193,7 +193,7 @@ def import_scenes(
       report: called with the reason why a scene is refused.
 
     Raises:
-      InputError: no scene can be used, a pattern matches none, or the file cannot be written.
+      InputError: no scene can be used, a pattern matches none, or the file cannot be written or holds something else.
     """
     if not out.name.endswith(".jsonl.gz"):
         raise InputError(f"{out}: give a name that ends in .jsonl.gz")
@@ -221,7 +221,7 @@ def import_scenes(
             scene_split = split
         divided_scenes.append(dataclasses.replace(scene, split=scene_split))
     try:
-        write_scenes(out, divided_scenes, summary.account)
+        write_scenes(out, divided_scenes, summary.account, replace=False)
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror}); give another name") from error
     return summary

@@ -111,7 +111,12 @@ def iterate_counted_scenes(path: Path) -> Iterator[Scene | InputError | ImportCo
         yield object_count
 
 
-def write_scenes(path: str | Path, scenes: Iterable[Scene], account: Mapping[str, ImportCount] | None = None) -> None:
+def write_scenes(
+    path: str | Path,
+    scenes: Iterable[Scene],
+    account: Mapping[str, ImportCount] | None = None,
+    replace: bool = True,
+) -> None:
     """Write a scene file, whole or not at all.
 
     Equal scenes and accounts give equal bytes.
@@ -120,8 +125,10 @@ def write_scenes(path: str | Path, scenes: Iterable[Scene], account: Mapping[str
       path: the file.
       scenes: the scenes.
       account: counts of an import by their unit, for a header line; None for no header.
+      replace: whether to replace a file that holds anything else.
 
     Raises:
+      InputError: the file holds something else, and is not to be replaced.
       ValueError: a number is NaN or infinite.
     """
     # One compact line per scene; without a time in the gzip header equal scenes give equal bytes.
@@ -130,7 +137,11 @@ def write_scenes(path: str | Path, scenes: Iterable[Scene], account: Mapping[str
         file_records.append({_HEADER_FIELD: account_to_json(account)})
     file_records.extend(map(_encode_scene, scenes))
     file_lines = [json.dumps(record, allow_nan=False, separators=(",", ":")) + "\n" for record in file_records]
-    write_atomic(expand_home(path), gzip.compress("".join(file_lines).encode(), mtime=0))
+    content = "".join(file_lines).encode()
+    path = expand_home(path)
+    if not replace and path.exists() and read_bytes(path) != content:
+        raise InputError(f"{path}: holds other scenes or another account of an import; remove it, or give another name")
+    write_atomic(path, gzip.compress(content, mtime=0))
 
 
 # Checked access to JSON

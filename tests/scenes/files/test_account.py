@@ -98,7 +98,7 @@ def test_account_of_episodes_counts_goals_and_starts(tmp_path):
     # Without goals upstairs that floor is refused, with its eight starts; a lamp hangs above all floors.
     goals = {"Home.glb_chair": EPISODES["goals_by_category"]["Home.glb_chair"] + [goal("lamp", 8, [0, 9.0, 0], [])]}
     content = EPISODES | {"goals_by_category": goals}
-    summary = import_source(tmp_path / "o.jsonl.gz", "habitat", write_json(tmp_path / "Home.json.gz", content))
+    summary = import_source(tmp_path / "p.jsonl.gz", "habitat", write_json(tmp_path / "Home.json.gz", content))
     assert numbers(summary, "episodes") == (27, 0, 18, {"in refused scenes": 8, "on no floor": 1})
     assert numbers(summary, "goals") == (2, 0, 2, {})
     assert numbers(summary, "objects") == (2, 0, 1, {"on no floor": 1})
