@@ -1,7 +1,7 @@
 """Parts shared by all commands: running one, printing text and tables, parsing options, caching compiled programs.
 
-`run_command` turns the errors of a command into one-line messages and exit codes. `PlainConsole` prints text from files
-safely, and `print_table` fits a table to the terminal. `parse_config` and `parse_arguments` build dataclasses of
+`run_command` turns the errors of a command into one-line messages and exit codes, and `print_table` fits a table to the
+terminal. `parse_config` and `parse_arguments` build dataclasses of
 settings from a command line, with and without `--config`.
 
 No module of `jaxnav.cli` imports JAX, Flax or SciPy at its top, so that help, completion and refusals of bad options
@@ -28,7 +28,6 @@ import sys
 import textwrap
 import types
 import typing
-import unicodedata
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeVar
@@ -38,7 +37,6 @@ import yaml
 from rich.console import Console
 from rich.measure import Measurement
 from rich.table import Table
-from rich.text import Text
 from tyro.constructors import (
     ConstructorRegistry,
     PrimitiveConstructorSpec,
@@ -49,6 +47,7 @@ from tyro.constructors import (
 )
 
 from jaxnav.errors import InputError, Interrupted
+from jaxnav.plain_console import PlainConsole, escape_control_chars
 from jaxnav.runs.config_files import CONFIGS, RENAMED_SETTINGS, apply_yaml, parse_setting
 from jaxnav.store.files import expand_home, write_atomic
 
@@ -59,8 +58,6 @@ PROGRAM_CACHE_DIR = "~/.cache/jaxnav/xla"
 #: Options that print the help.
 HELP_OPTIONS = ("-h", "--help")
 
-#: Unicode categories of characters that control a terminal, hide or reorder text, end a line, or are unassigned.
-_ESCAPED_CATEGORIES = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 #: Characters of the boxes in which tyro prints its messages.
 _BOX_CHARACTERS = "╭╮╰╯│─"
 #: Narrowest width, in columns, of anything that is printed; terminals may be narrower.
@@ -210,21 +207,6 @@ def _has_jax_backend() -> bool:
 # Printing
 
 
-class PlainConsole(Console):
-    """Console that shows every text literally, since names may come from files.
-
-    Square brackets are not markup, and characters that control the terminal or reorder text are escaped.
-    """
-
-    def __init__(self, **options: Any) -> None:
-        """Prepare, with options as of `rich.console.Console`."""
-        super().__init__(highlight=False, markup=False, emoji=False, **options)
-
-    def render_str(self, text: str, **options: Any) -> Text:
-        """Return the text with control characters escaped."""
-        return super().render_str(escape_control_chars(text), **options)
-
-
 def make_result_console() -> Console:
     """Return the console for results on stdout: as wide as the terminal, or too wide to wrap in a file or a pipe."""
     console = PlainConsole()
@@ -301,21 +283,6 @@ def _select_columns(table: Table, widths: Mapping[int, int]) -> Table:
         row_cells = [column_cells[row_index] for column_cells in cells_by_column]
         selected.add_row(*row_cells, style=row.style, end_section=row.end_section)
     return selected
-
-
-def escape_control_chars(text: str, keep: str = "") -> str:
-    """Return a text with control characters as escape sequences.
-
-    Args:
-      text: any characters.
-      keep: control characters that stay as they are.
-    """
-    escaped = []
-    for char in text:
-        if char not in keep and unicodedata.category(char) in _ESCAPED_CATEGORIES:
-            char = char.encode("unicode_escape").decode()
-        escaped.append(char)
-    return "".join(escaped)
 
 
 @contextlib.contextmanager

@@ -12,7 +12,6 @@ from rich.console import Console
 
 from jaxnav.choices import Costs, CounterfactualMemory, EstimatorName, Form, Removal, ShiftKind
 from jaxnav.cli.console import (
-    escape_control_chars,
     make_result_console,
     name_evaluation,
     name_numbers,
@@ -25,6 +24,7 @@ from jaxnav.cli.console import (
     write_latest,
 )
 from jaxnav.errors import InputError
+from jaxnav.plain_console import escape_control_chars
 from jaxnav.store.files import expand_home
 
 DESCRIPTION = "Evaluate a run, a policy or an agent of your own, or print a finished evaluation again."

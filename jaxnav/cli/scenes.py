@@ -12,7 +12,6 @@ from rich.console import Console
 
 from jaxnav.cli.console import (
     HELP_OPTIONS,
-    escape_control_chars,
     make_result_console,
     parse_arguments,
     print_table,
@@ -20,6 +19,7 @@ from jaxnav.cli.console import (
     run_command,
 )
 from jaxnav.errors import InputError
+from jaxnav.plain_console import escape_control_chars
 from jaxnav.scenes.files.importing import SceneFormat, SceneSplit
 from jaxnav.scenes.worlds import WORLDS, SceneSource
 

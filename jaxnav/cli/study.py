@@ -5,9 +5,10 @@ import sys
 
 from rich.console import Console
 
-from jaxnav.cli.console import escape_control_chars, parse_config, run_command
+from jaxnav.cli.console import parse_config, run_command
 from jaxnav.errors import InputError
 from jaxnav.experiments.config import EXPERIMENTS, ExperimentConfig
+from jaxnav.plain_console import escape_control_chars
 
 DESCRIPTION = (
     "Run an experiment: train and measure everything that has no results yet, and write its pages. `jaxnav study NAME` "

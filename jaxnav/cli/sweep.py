@@ -9,7 +9,6 @@ from rich.console import Console
 
 from jaxnav.choices import Decoding, EstimatorName, Form, ShiftKind
 from jaxnav.cli.console import (
-    escape_control_chars,
     make_result_console,
     name_evaluation,
     name_numbers,
@@ -22,6 +21,7 @@ from jaxnav.cli.console import (
     write_latest,
 )
 from jaxnav.errors import InputError
+from jaxnav.plain_console import escape_control_chars
 from jaxnav.progress import show_activity
 from jaxnav.store.files import expand_home
 

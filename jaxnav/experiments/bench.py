@@ -19,6 +19,7 @@ from jaxnav.evaluation.grid import EpisodeOutcome
 from jaxnav.evaluation.variants import EvaluationRow
 from jaxnav.experiments.config import AgentRun, ExperimentConfig, agent_runs
 from jaxnav.experiments.table import ResultRow, ResultTable, read_part
+from jaxnav.plain_console import to_plain_console
 from jaxnav.runs.evaluate import Results, evaluate
 from jaxnav.runs.policies import load_policies
 from jaxnav.runs.run import Run, load_run_config, run_settings
@@ -62,7 +63,7 @@ class Bench:
 
     def __init__(self, config: ExperimentConfig, console: Console) -> None:
         self.config = config
-        self.console = console
+        self.console = to_plain_console(console)
         self._runs = {(run.world, run.agent): run for run in agent_runs(config)}
         self._scores: dict[tuple[str, str, float], Scores] = {}
         #: Folder of the outcomes of a part that is not finished; None to keep none.

@@ -34,6 +34,7 @@ from jaxnav.experiments.pages import check_page, render_page
 from jaxnav.experiments.scores import measure_account, measure_evaluation, measure_frontier, measure_groups
 from jaxnav.experiments.table import ResultRow, ResultTable, has_part, read_part, read_settings, write_part
 from jaxnav.experiments.trials import measure_growth, measure_trials, measure_variants
+from jaxnav.plain_console import to_plain_console
 from jaxnav.store.files import list_differences
 
 
@@ -151,6 +152,8 @@ def run_experiment(config: ExperimentConfig, console: Console) -> list[str]:
     Raises:
       InputError: a document is not a page of an experiment, or a run is impossible.
     """
+    console = to_plain_console(console)
+
     # Fail early: a page that cannot be written, or results that would be lost, would waste the measurements.
     for document, template in config.pages.items():
         check_page(Path(document), template)

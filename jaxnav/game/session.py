@@ -14,6 +14,7 @@ from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
 from jaxnav.evaluation.grid import start_states
 from jaxnav.game.config import PlayConfig
 from jaxnav.layout import EstimatorConfig
+from jaxnav.plain_console import to_plain_console
 from jaxnav.policies.agent_loop import AgentLoop
 from jaxnav.policies.method import ActionControl, Knowledge
 from jaxnav.runs.config import LayoutConfig, RunConfig, WorldConfig
@@ -112,6 +113,8 @@ def prepare_game(config: PlayConfig, console: Console) -> Game:
     Raises:
       InputError: no such scenes, goal or policy, or a policy of another world or without actions to advise.
     """
+    console = to_plain_console(console)
+
     # Check the policy first, since compiling scenes takes longer.
     policy = config.policy
     adviser = None

@@ -21,6 +21,7 @@ from jaxnav.evaluation.report import (
 from jaxnav.experiments.figures import gap_figure, similarity_figure
 from jaxnav.experiments.gap_traces import BELIEFS, mean_by_step, truncate_to_shortest
 from jaxnav.experiments.table import Curve
+from jaxnav.plain_console import PlainConsole, to_plain_console
 from jaxnav.policies.methods import method_label
 from jaxnav.progress import show_activity
 from jaxnav.report.charts import (
@@ -87,6 +88,7 @@ def make_report(run: Run, reference_run: Run | None, config: ReportConfig, conso
     Raises:
       InputError: no finished run, an impossible option, or runs that cannot be compared.
     """
+    console = to_plain_console(console)
     _check(run, reference_run, config)
     by_shift = measure_shifts(run, reference_run, config, console)
 
@@ -119,7 +121,7 @@ def make_report(run: Run, reference_run: Run | None, config: ReportConfig, conso
 
 
 def measure_shifts(
-    run: Run, reference_run: Run | None, config: ReportConfig, console: Console
+    run: Run, reference_run: Run | None, config: ReportConfig, console: PlainConsole
 ) -> dict[float, ShiftMeasurements]:
     """Measure at each shift once, and return the measurements in the order of the options."""
     # The layout of training comes first, so that replays of other layouts can show it, too.

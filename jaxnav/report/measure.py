@@ -4,13 +4,13 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from rich.console import Console
 
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.report import ExperienceLead, row_label
 from jaxnav.evaluation.similarity import cooccurrence_counts
 from jaxnav.experiments.gap_traces import GapTraces, trace_gaps
 from jaxnav.experiments.similarity import SuccessBySimilarity, compute_similarity_points, relate_success_to_similarity
+from jaxnav.plain_console import PlainConsole
 from jaxnav.progress import show_activity
 from jaxnav.report.config import ReportConfig
 from jaxnav.report.replays import ReplayAgent, Replays, TrainedLayout, make_replays
@@ -49,7 +49,7 @@ def measure_shift(
     reference_run: Run | None,
     shift: float,
     config: ReportConfig,
-    console: Console,
+    console: PlainConsole,
     trained_layout: TrainedLayout | None = None,
 ) -> ShiftMeasurements:
     """Measure a run at one layout shift.
@@ -74,7 +74,7 @@ def measure_shift(
     # Compare with layout-blind agents, and replay them with best actions, too.
     account = None
     if reference_run is not None:
-        quiet_console = Console(quiet=True)
+        quiet_console = PlainConsole(quiet=True)
         with show_activity(console, f"evaluating the reference run at shift {shift:g}"):
             reference_world = compile_evaluation_world(
                 reference_run.config, config.split, None, shift, quiet_console, shift_by=config.shift_by
@@ -114,7 +114,7 @@ def measure_shift(
     return ShiftMeasurements(results, account, similarity, gap_traces, replays, world)
 
 
-def _evaluate(run: Run, shift: float, world: CompiledWorld, config: ReportConfig, console: Console) -> Results:
+def _evaluate(run: Run, shift: float, world: CompiledWorld, config: ReportConfig, console: PlainConsole) -> Results:
     """Evaluate a run at a shift, as `jaxnav eval` does."""
     return evaluate(
         run,

@@ -27,6 +27,7 @@ from jaxnav.evaluation.episodes import EpisodeList, join_episode_lists
 from jaxnav.evaluation.report import UNTRAINED_VARIANTS, package_versions, row_label
 from jaxnav.evaluation.statistics import Interval, mean_interval
 from jaxnav.evaluation.variants import EvaluationRow
+from jaxnav.plain_console import to_plain_console
 from jaxnav.runs.config import RunConfig, WorldConfig
 from jaxnav.runs.evaluate import evaluate
 from jaxnav.runs.results import Results
@@ -181,7 +182,7 @@ def run_benchmark(
       InputError: unknown benchmark or track, tables that differ from the manifest, a policy of other categories, or
         a subject that `jaxnav.evaluate` refuses.
     """
-    console = console or Console(quiet=True)
+    console = to_plain_console(console)
     benchmark = load_benchmark(name)
     found_subject = find_subject(subject)
     if isinstance(found_subject, PolicySubject):

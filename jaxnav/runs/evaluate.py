@@ -42,6 +42,7 @@ from jaxnav.evaluation.variants import (
     table_row,
     table_rows,
 )
+from jaxnav.plain_console import to_plain_console
 from jaxnav.policies.methods import find_method, method_label
 from jaxnav.progress import show_activity
 from jaxnav.runs.config import RunConfig
@@ -142,7 +143,7 @@ def evaluate(
         impossible.
     """
     check_seed(seed)
-    console = console or Console(quiet=True)
+    console = to_plain_console(console)
     found_subject = find_subject(subject)
     if isinstance(found_subject, AgentSubject):
         policy_options = {
@@ -570,7 +571,7 @@ def sweep_shifts(
     arguments and errors see `sweep`.
     """
     check_seed(seed)
-    console = console or Console(quiet=True)
+    console = to_plain_console(console)
     if not len(epsilon):
         raise InputError("--epsilon: give at least one number")
     config, policies = _load_layout_policies(source, setting, hold)

@@ -7,7 +7,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from rich.console import Console
 
 from jaxnav.baselines.frontier import run_frontier_search
 from jaxnav.baselines.shortest_path import run_oracle
@@ -18,6 +17,7 @@ from jaxnav.evaluation.grid import EpisodeOutcome
 from jaxnav.evaluation.notes import missing_interval_notes
 from jaxnav.evaluation.report import build_difference, build_report
 from jaxnav.evaluation.variants import EvaluationRow
+from jaxnav.plain_console import PlainConsole
 from jaxnav.progress import show_activity
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.results import Results, build_result_rows
@@ -40,7 +40,7 @@ def evaluate_agents(
     num_episodes: int,
     seed: int,
     compiled: CompiledWorld | None,
-    console: Console,
+    console: PlainConsole,
 ) -> Results:
     """Evaluate agents on the fixed episodes of a world; see `jaxnav.evaluate`."""
     # A world gives the task; a scene file replaces its scenes.

@@ -33,6 +33,7 @@ from rich.table import Column
 from jaxnav.env.objectnav import EnvParams, ObjectNav
 from jaxnav.errors import InputError, Interrupted, MissingSplitError
 from jaxnav.layout import ESTIMATORS, EstimatorConfig
+from jaxnav.plain_console import PlainConsole, to_plain_console
 from jaxnav.policies.agent_loop import AgentLoop
 from jaxnav.policies.method import Knowledge
 from jaxnav.policies.methods import METHODS, find_method
@@ -152,8 +153,7 @@ def train_points(
     require_float32()
     stopwatch = Stopwatch.start()
     mesh = connect_devices(config)
-    if console is None or not is_first_process():
-        console = Console(quiet=True)
+    console = to_plain_console(console if is_first_process() else None)
 
     # All processes must train the same run. Settings are compared before the scenes, whose compilation may take long.
     check_agreement(json.dumps(make_manifest(run_settings(config))))
@@ -177,7 +177,7 @@ def _train_in_run_dir(
     mesh: Mesh | None,
     lock: FolderLock,
     stopwatch: "Stopwatch",
-    console: Console,
+    console: PlainConsole,
     callback: TrainCallback | None,
 ) -> None:
     """Train in a run directory whose lock is held; see `train_points`."""
@@ -269,7 +269,7 @@ def connect_devices(config: RunConfig) -> Mesh | None:
     return devices.mesh(config.seeds, config.ppo.num_envs, config.ppo.minibatches)
 
 
-def warn_if_rollout_too_short(config: RunConfig, console: Console) -> None:
+def warn_if_rollout_too_short(config: RunConfig, console: PlainConsole) -> None:
     """Warn if rollouts are shorter than the interval between two choices of the method."""
     # Methods such as `semexp` choose once in several actions.
     choice_interval = find_method(config.method).control.interval
@@ -281,7 +281,7 @@ def warn_if_rollout_too_short(config: RunConfig, console: Console) -> None:
         )
 
 
-def warn_if_more_steps(config: RunConfig, console: Console) -> None:
+def warn_if_more_steps(config: RunConfig, console: PlainConsole) -> None:
     """Say so if whole chunks make the run clearly longer than its `total_steps`."""
     asked_steps = config.total_steps
     num_steps = config.total_updates * config.steps_per_update
@@ -293,7 +293,7 @@ def warn_if_more_steps(config: RunConfig, console: Console) -> None:
 
 
 def prepare_training(
-    config: RunConfig, world: CompiledWorld, manifest: dict[str, Any], console: Console
+    config: RunConfig, world: CompiledWorld, manifest: dict[str, Any], console: PlainConsole
 ) -> Preparation:
     """Layout prior, layout estimator and the method's own statistics, learned once in each run.
 
@@ -375,7 +375,7 @@ def named_estimator(config: RunConfig) -> EstimatorConfig:
 
 
 def calibrate_estimator(
-    config: RunConfig, world: CompiledWorld, exploration: Exploration, console: Console
+    config: RunConfig, world: CompiledWorld, exploration: Exploration, console: PlainConsole
 ) -> EstimatorConfig:
     """Configuration of the layout estimator, with strength and reduction.
 
@@ -443,7 +443,11 @@ def learn_knowledge(
 
 
 def fit_policies(
-    config: RunConfig, world: CompiledWorld, estimator_config: EstimatorConfig, knowledge: Knowledge, console: Console
+    config: RunConfig,
+    world: CompiledWorld,
+    estimator_config: EstimatorConfig,
+    knowledge: Knowledge,
+    console: PlainConsole,
 ) -> tuple[Params, ...]:
     """Fit the policy of each seed to searches in the training scenes of the first bank; see `Method.fit`.
 
@@ -484,7 +488,7 @@ def _finish_fitted_run(
     preparation: Preparation,
     lock: FolderLock,
     stopwatch: "Stopwatch",
-    console: Console,
+    console: PlainConsole,
 ) -> None:
     """Export the policies that were fitted, and measure them."""
     exploration, estimator_config, knowledge, fitted_params = preparation
@@ -505,7 +509,7 @@ def _finish_fitted_run(
 
 
 def _write_reach(
-    config: RunConfig, validator: Validator, policies: Mapping[str, Sequence[Params]], console: Console
+    config: RunConfig, validator: Validator, policies: Mapping[str, Sequence[Params]], console: PlainConsole
 ) -> None:
     """Measure the exported policies of a run, and store their success within budgets of actions."""
     with show_activity(console, "measuring the exported policies"):
@@ -583,7 +587,7 @@ def make_trainer(
 
 
 def _restore_or_init(
-    config: RunConfig, trainer: Trainer, env_params: EnvParams, manifest: dict[str, Any], console: Console
+    config: RunConfig, trainer: Trainer, env_params: EnvParams, manifest: dict[str, Any], console: PlainConsole
 ) -> tuple[TrainerStates, int]:
     """Training states of the last checkpoint or of the start, and the number of updates done in them.
 
@@ -606,7 +610,7 @@ def _restore_or_init(
 
 
 def _make_validator(
-    config: RunConfig, trainer: Trainer, knowledge: Knowledge, world: CompiledWorld, console: Console
+    config: RunConfig, trainer: Trainer, knowledge: Knowledge, world: CompiledWorld, console: PlainConsole
 ) -> Validator | None:
     """Validator of the policies; None without validations or val scenes."""
     if not config.validations:
@@ -646,7 +650,7 @@ class TrainingSession:
     manifest: dict[str, Any]
     lock: FolderLock
     stopwatch: "Stopwatch"
-    console: Console
+    console: PlainConsole
     callback: TrainCallback | None = None
 
 
@@ -849,7 +853,7 @@ class Interrupts:
 class ProgressDisplay:
     """Progress of training on a console: a bar on a terminal, else lines."""
 
-    def __init__(self, config: RunConfig, update: int, console: Console) -> None:
+    def __init__(self, config: RunConfig, update: int, console: PlainConsole) -> None:
         """Prepare to show a run that starts or resumes after `update`."""
         # Long words are cut, never the bar and the times.
         words_width = max(1, console.width - _BAR_WIDTH - _TIMES_WIDTH)

@@ -12,13 +12,13 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
-from rich.console import Console
 
 from jaxnav.choices import Decoding
 from jaxnav.env.objectnav import EnvParams
 from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
 from jaxnav.evaluation.grid import EpisodeOutcome, Evaluator, episode_metrics
 from jaxnav.evaluation.variants import EvaluationRow, inference_grid
+from jaxnav.plain_console import PlainConsole
 from jaxnav.policies.agent_loop import AgentLoop
 from jaxnav.policies.method import Knowledge
 from jaxnav.policies.methods import find_method
@@ -57,7 +57,12 @@ class Validator:
     """
 
     def __init__(
-        self, config: RunConfig, agent_loop: AgentLoop, knowledge: Knowledge, training: CompiledWorld, console: Console
+        self,
+        config: RunConfig,
+        agent_loop: AgentLoop,
+        knowledge: Knowledge,
+        training: CompiledWorld,
+        console: PlainConsole,
     ) -> None:
         """Prepare the episodes; compilation happens at the first measurement.
 

@@ -19,6 +19,7 @@ from jaxnav.env.make import build_environment
 from jaxnav.env.objectnav import EnvParams, ObjectNav
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
+from jaxnav.plain_console import PlainConsole, to_plain_console
 from jaxnav.policies.method import Knowledge, Method
 from jaxnav.progress import show_activity
 from jaxnav.runs.config import RunConfig
@@ -95,6 +96,7 @@ class CompiledWorld:
 
 def compile_training_world(config: RunConfig, console: Console) -> CompiledWorld:
     """Compile the training scenes of a run."""
+    console = to_plain_console(console)
     scenes = _load_scenes(config, config.world, "train", config.scenes, config.worlds.shift, console)
     world = _compile_world(config, scenes, {}, config.train_step_limit, console)
     has_expert = config.ppo.has_guidance or any(stage.uses_expert for stage in config.stages)
@@ -103,7 +105,7 @@ def compile_training_world(config: RunConfig, console: Console) -> CompiledWorld
 
 def compile_sample_bank(config: RunConfig) -> Bank:
     """Compile the first few training scenes of a run."""
-    scenes = _load_scenes(config, config.world, "train", config.scenes, config.worlds.shift, Console(quiet=True))
+    scenes = _load_scenes(config, config.world, "train", config.scenes, config.worlds.shift, PlainConsole(quiet=True))
     # A scene file may hold fewer scenes.
     num_scenes = min(_NUM_SAMPLE_SCENES, len(scenes))
     return compile_bank((scenes[index] for index in range(num_scenes)), config.task)
@@ -135,6 +137,7 @@ def compile_evaluation_world(
       InputError: unknown split or world, bad scene file, no scene of the split, a bad shift, no exchange by context
         that misleads, or both a file and a world.
     """
+    console = to_plain_console(console)
     world_name = world or config.world
     if split not in SPLITS:
         raise InputError(f"--split {split}: choose one of {', '.join(SPLITS)}")
@@ -170,7 +173,7 @@ def _load_scenes(
     split: str,
     path: Path | None,
     shift: float,
-    console: Console,
+    console: PlainConsole,
     shift_by: ShiftKind = "size",
 ) -> Scenes:
     """Read or generate the scenes of a split, and shift their layout."""
@@ -205,7 +208,7 @@ def fit_run_exchange(config: RunConfig) -> ContextExchange:
 
 
 def _compile_world(
-    config: RunConfig, scenes: Scenes, step_limits: dict[str, int], step_limit: int, console: Console
+    config: RunConfig, scenes: Scenes, step_limits: dict[str, int], step_limit: int, console: PlainConsole
 ) -> CompiledWorld:
     """Compile scenes in memory, or to shards where there are more than `worlds.shard_scenes`."""
     shaping = WORLDS[config.world].shaping if config.worlds.shaping is None else config.worlds.shaping
@@ -241,7 +244,7 @@ def _compile_world(
     )
 
 
-def _compile_to_cache(config: RunConfig, scenes: Scenes, console: Console) -> Shards:
+def _compile_to_cache(config: RunConfig, scenes: Scenes, console: PlainConsole) -> Shards:
     """Compile scenes to shards in the cache folder, unless they are there."""
     with Progress(console=console, disable=not console.is_terminal) as progress:
         progress_bar = progress.add_task(f"compiling {len(scenes):,} scenes")

@@ -29,6 +29,7 @@ from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
 from jaxnav.evaluation.playback import EpisodeTrace
 from jaxnav.evaluation.variants import EvaluationRow, table_row
+from jaxnav.plain_console import PlainConsole, to_plain_console
 from jaxnav.policies.methods import method_label
 from jaxnav.progress import show_activity
 from jaxnav.runs.config import RunConfig
@@ -164,7 +165,7 @@ def play_episode(
       InputError: no finished run and no policy, no such episode, a goal that cannot be reached at some shift, an
         impossible epsilon, or the variant `scde` of a policy that cannot act without experience.
     """
-    console = console or Console(quiet=True)
+    console = to_plain_console(console)
 
     # The arm without layout weights acts in the variant `baseline`.
     arms = tuple(dict.fromkeys("baseline" if variant == "baseline" else "layout" for variant in variants))
@@ -236,7 +237,7 @@ def _draw_shifted_episodes(
     scenes: Path | None,
     shifts: Sequence[float | None],
     shift_by: ShiftKind,
-    console: Console,
+    console: PlainConsole,
 ) -> list[ShiftedEpisodes]:
     """Compile the scenes at every shift, and draw the episodes of the first shift for all of them."""
     worlds = []
@@ -273,7 +274,7 @@ def _check_index(index: int, episodes_by_shift: Sequence[ShiftedEpisodes]) -> np
     return is_reachable
 
 
-def _report_success(success_by_name: Mapping[str, Sequence[bool]], console: Console) -> None:
+def _report_success(success_by_name: Mapping[str, Sequence[bool]], console: PlainConsole) -> None:
     """Print the number of successful episodes of each comparison partner, and the number that no other finds."""
     success = np.array(list(success_by_name.values()))  # [partners, E]
     for i, name in enumerate(success_by_name):

@@ -11,8 +11,9 @@ from support.commands import contents
 
 from jaxnav.__main__ import main
 from jaxnav.cli import console
-from jaxnav.cli.console import PlainConsole, make_result_console, print_table, run_command
+from jaxnav.cli.console import make_result_console, print_table, run_command
 from jaxnav.errors import InputError
+from jaxnav.plain_console import PlainConsole
 
 SETTINGS = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs", "jax_enable_compilation_cache")
 

@@ -5,22 +5,31 @@ Seen to fail: with a console that takes markup, `[/x]` in a path ends the comman
 ends the drawing of the learning curves.
 """
 
+import ast
 import contextlib
 import dataclasses
 import gzip
+import io
 import json
 import os
 import subprocess
 import sys
 import unicodedata
+from pathlib import Path
 
 import pytest
+from rich.console import Console
 from rich.table import Table
 from support.scenes import SMALL, draw
+from support.tiny_run import tiny_config
 
+import jaxnav
 from jaxnav.__main__ import COMMANDS, main
-from jaxnav.cli.console import PlainConsole, escape_control_chars, run_command
+from jaxnav.cli.console import run_command
 from jaxnav.errors import InputError
+from jaxnav.plain_console import PlainConsole, escape_control_chars, to_plain_console
+from jaxnav.runs.config import RunConfig
+from jaxnav.runs.worlds import compile_evaluation_world
 from jaxnav.scenes.files.scene_file import read_scenes, write_scenes
 from jaxnav.viz.learning import learning_figure
 
@@ -188,6 +197,77 @@ def test_console_escapes_lines_tables_and_titles(capsys):
     output = capsys.readouterr().out
     assert_escaped(output)
     assert output.startswith(r"[/x][bold]\x1b[31m\x07\n\u202e$\frac$ :smile:")
+
+
+# Consoles of a caller
+
+
+def hostile_console(**options):
+    """Return a console that takes markup, as `rich.console.Console()` does."""
+    return Console(file=io.StringIO(), width=500, **options)
+
+
+def test_to_plain_console_prints_literally_to_the_console_of_a_caller():
+    console = hostile_console(record=True)
+    plain_console = to_plain_console(console)
+    plain_console.print(f"{HOSTILE} :smile: 12", style="red")
+    expected = r"[/x][bold]\x1b[31m\x07\n\u202e$\frac$ :smile: 12" + "\n"
+    assert console.file.getvalue() == expected
+    assert console.export_text() == expected
+    assert to_plain_console(plain_console) is plain_console
+
+    # The console of the caller still takes markup.
+    console.print("[bold]x[/bold]")
+    assert console.file.getvalue().endswith("\nx\n")
+
+
+def test_to_plain_console_stays_quiet(capsys):
+    for console in (None, Console(quiet=True)):
+        to_plain_console(console).print("x")
+    assert "".join(capsys.readouterr()) == ""
+
+
+def list_console_functions():
+    """Yield module, name and source of every function that takes any console, the command line's own excepted."""
+    package_folder = Path(jaxnav.__file__).parent
+    for module in package_folder.rglob("*.py"):
+        if module.parent.name == "cli":
+            continue
+        source = module.read_text()
+        for node in ast.walk(ast.parse(source)):
+            if not isinstance(node, ast.FunctionDef):
+                continue
+            for argument in (*node.args.args, *node.args.kwonlyargs):
+                annotation = "" if argument.annotation is None else ast.unparse(argument.annotation)
+                if argument.arg == "console" and "PlainConsole" not in annotation:
+                    yield module.name, node.name, ast.get_source_segment(source, node)
+
+
+def test_every_function_prints_literally_to_the_console_of_a_caller():
+    # `show_activity` prints `Text`, which holds no markup.
+    functions = [function for function in list_console_functions() if function[1] != "show_activity"]
+    assert len(functions) > 10
+    for module, name, source in functions:
+        assert "to_plain_console(" in source or "console.print(" not in source, f"{module}: {name}"
+
+
+@pytest.mark.filterwarnings("ignore:Glyph")
+def test_compiling_a_world_prints_the_name_of_its_file_literally(scene_file):
+    console = hostile_console()
+    config = RunConfig(world="rooms")
+    with contextlib.suppress(InputError):
+        compile_evaluation_world(config, "val", scene_file, None, console)
+    assert_escaped(console.file.getvalue())
+
+
+@pytest.mark.slow
+def test_training_and_evaluation_print_the_run_directory_literally(tmp_path):
+    config = tiny_config(tmp_path)
+    config = dataclasses.replace(config, run_dir=tmp_path / "[" / "x]", seeds=1, arms=("layout",))
+    console = hostile_console()
+    run = jaxnav.train(config, console)
+    assert f"{config.run_dir}: done in" in console.file.getvalue()
+    jaxnav.evaluate(run, episodes=2, console=console)
 
 
 def test_refusal_of_a_hostile_name_is_one_line(capsys):

@@ -17,6 +17,7 @@ from support.tiny_run import draw_run, tiny_config
 import jaxnav
 from jaxnav.errors import InputError
 from jaxnav.evaluation.report import accounting_table, results_table
+from jaxnav.plain_console import PlainConsole
 from jaxnav.report.config import ReportConfig
 from jaxnav.report.make import make_report, make_sections
 from jaxnav.report.measure import measure_shift
@@ -25,7 +26,7 @@ from jaxnav.runs.evaluate import measure_leads
 from jaxnav.scenes.tables.observation_row import Detector
 from jaxnav.scenes.task import NUM_ACTIONS
 
-QUIET = Console(quiet=True)
+QUIET = PlainConsole(quiet=True)
 NUM_EPISODES = 24
 NUM_REPLAYS = 10
 OPTIONS = ReportConfig(

@@ -66,7 +66,7 @@ MISTAKES = (
     Mistake("store/files.py", "fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)", "pass",
             "promises/test_one_writer.py"),
     Mistake("runs/train.py", "signal.signal(handled_number, signal.SIG_DFL)", "pass", "promises/test_interrupts.py"),
-    Mistake("cli/console.py", "markup=False", "markup=True", NAMES),
+    Mistake("plain_console.py", '"markup": False', '"markup": True', NAMES),
     Mistake("cli/console.py", '(escape_control_chars(buffer.read(), keep="\\n") for', "(buffer.read() for", NAMES),
     Mistake("cli/console.py", "case MemoryError():", "case ZeroDivisionError():", "promises/test_bounds.py"),
     Mistake("__init__.py", '"""Layout', 'import matplotlib  # noqa\n"""Layout', EXTRAS),
