@@ -13,9 +13,12 @@ import logging
 import os
 import re
 import shutil
+import sys
 import tempfile
 import textwrap
-from collections.abc import Iterator, Mapping
+import threading
+import weakref
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -136,7 +139,8 @@ def restore_checkpoint(
     with _silence_libraries(), _open_checkpointer(run_dir) as checkpointer:
         for step in sorted((saved.step for saved in checkpointer.checkpoints), reverse=True):
             try:
-                state = _load_step(checkpointer, folder / str(step), step, abstract_state, expected_manifest)
+                with _silence_libraries():
+                    state = _load_step(checkpointer, folder / str(step), step, abstract_state, expected_manifest)
             except _DamageError as error:
                 damage_messages.append(str(error))
             else:
@@ -327,21 +331,6 @@ def _plain_path(folder: Path) -> Iterator[Path]:
         yield link / folder.name
 
 
-@contextlib.contextmanager
-def _silence_libraries() -> Iterator[None]:
-    """Keep Orbax from logging pages about errors that are reported in one line."""
-    # A level above the highest silences a logger.
-    loggers = [logging.getLogger(logger_name) for logger_name in ("absl", "asyncio")]
-    saved_levels = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.CRITICAL + 1)
-    try:
-        yield
-    finally:
-        for logger, saved_level in zip(loggers, saved_levels, strict=True):
-            logger.setLevel(saved_level)
-
-
 def _check_free_inodes(run_dir: Path) -> None:
     """Refuse a disk with too few inodes, on which threads of Orbax wait for minutes for folders that do not exist."""
     if not hasattr(os, "statvfs"):  # not a POSIX system
@@ -354,6 +343,67 @@ def _check_free_inodes(run_dir: Path) -> None:
             f"{run_dir}: cannot be saved (the disk has {disk.f_favail} free inodes, a checkpoint needs {_NUM_INODES}); "
             "remove files, then run the same command again"
         )
+
+
+# Errors of Orbax and TensorStore
+
+#: Threads of Orbax that were running when a save or load failed.
+_failed_threads: weakref.WeakSet[threading.Thread] = weakref.WeakSet()
+
+
+@contextlib.contextmanager
+def _silence_libraries() -> Iterator[None]:
+    """Keep Orbax and TensorStore from printing pages about errors that are reported in one line.
+
+    Orbax stops at the first error, while its threads and those of TensorStore go on with other arrays. These threads
+    may fail later, even while the process ends. Such late errors are dropped, too; the errors of other threads are not.
+    """
+    loggers = [logging.getLogger(logger_name) for logger_name in ("absl", "asyncio")]
+    saved_levels = [logger.level for logger in loggers]
+    saved_hook = sys.unraisablehook
+    earlier_threads = set(threading.enumerate())
+
+    # A level above the highest silences a logger.
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL + 1)
+    if not isinstance(saved_hook, _TensorStoreHook):
+        sys.unraisablehook = _TensorStoreHook(saved_hook)
+
+    # Where nothing fails, nothing is left behind.
+    try:
+        yield
+        sys.unraisablehook = saved_hook
+    except BaseException:
+        for thread in set(threading.enumerate()) - earlier_threads:
+            if type(thread).__module__.startswith("orbax."):
+                _failed_threads.add(thread)
+        for logger in loggers:
+            logger.addFilter(_is_no_late_error)  # adds it once
+        raise
+    finally:
+        for logger, saved_level in zip(loggers, saved_levels, strict=True):
+            logger.setLevel(saved_level)
+
+
+def _is_no_late_error(record: logging.LogRecord) -> bool:
+    """False for what threads of Orbax log after a failure, and for what asyncio logs about their tasks."""
+    is_task_of_orbax = record.name == "asyncio" and "/orbax/" in record.getMessage()
+    return threading.current_thread() not in _failed_threads and not is_task_of_orbax
+
+
+class _TensorStoreHook:
+    """Replacement of `sys.unraisablehook`, which drops errors of TensorStore at event loops that Orbax has closed."""
+
+    def __init__(self, earlier_hook: Callable[[Any], object]) -> None:
+        """Keep the hook that prints all other errors."""
+        self._earlier_hook = earlier_hook
+
+    def __call__(self, unraisable: Any) -> None:
+        """Print an error that nobody can catch, unless TensorStore has called a closed event loop."""
+        # TensorStore names no object, as Python does.
+        is_closed_loop = isinstance(unraisable.exc_value, RuntimeError) and "Event loop" in str(unraisable.exc_value)
+        if not (is_closed_loop and unraisable.object is None):
+            self._earlier_hook(unraisable)
 
 
 @contextlib.contextmanager

@@ -1,11 +1,13 @@
 """Checkpoints: exact round trips, refusals, and kills at any moment."""
 
 import errno
+import logging
 import os
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 import types
 from collections.abc import Mapping
@@ -245,6 +247,52 @@ def test_full_disk_is_one_line_and_loses_nothing(tmp_path, monkeypatch, error):
     assert restore_latest(tmp_path)[1] == 1
     checkpoint.save_checkpoint(tmp_path, 2, make_state(2), MANIFEST)
     assert restore_latest(tmp_path)[1] == 2
+
+
+class LateThread(threading.Thread):
+    """Thread as those of Orbax, which logs an error after the save to which it belongs has failed."""
+
+    __module__ = "orbax.checkpoint"
+
+    def __init__(self, event: threading.Event) -> None:
+        super().__init__()
+        self.event = event
+
+    def run(self) -> None:
+        self.event.wait()
+        logging.getLogger("absl").error("late")
+
+
+def test_late_errors_of_a_failed_save_are_dropped_and_no_other_error(tmp_path, monkeypatch, caplog):
+    printed_errors = []
+    monkeypatch.setattr(sys, "unraisablehook", printed_errors.append)
+    save_has_failed = threading.Event()
+    late_thread = LateThread(save_has_failed)
+
+    def fail(*_: Any, **__: Any) -> None:
+        late_thread.start()
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(checkpoint.ocp.training.Checkpointer, "save", fail)
+    with pytest.raises(InputError, match="No space left on device"):
+        checkpoint.save_checkpoint(tmp_path, 1, make_state(1), MANIFEST)
+
+    # A thread of Orbax fails, asyncio destroys one of its tasks, and TensorStore calls the event loop of the save.
+    save_has_failed.set()
+    late_thread.join()
+    logging.getLogger("asyncio").error("Task was destroyed but it is pending!\ntask: .../orbax/checkpoint/futures.py:1")
+    closed_loop = types.SimpleNamespace(exc_value=RuntimeError("Event loop is closed"), object=None)
+    sys.unraisablehook(closed_loop)  # pyright: ignore[reportArgumentType]
+    assert caplog.messages == []
+    assert printed_errors == []
+
+    # Errors elsewhere in the program are printed.
+    for logger_name in ("absl", "asyncio"):
+        logging.getLogger(logger_name).error(f"own {logger_name}")
+    own_error = types.SimpleNamespace(exc_value=RuntimeError("Event loop is closed"), object=print)
+    sys.unraisablehook(own_error)  # pyright: ignore[reportArgumentType]
+    assert caplog.messages == ["own absl", "own asyncio"]
+    assert printed_errors == [own_error]
 
 
 @pytest.mark.parametrize(("num_inodes", "num_free", "is_refused"), [(50, 39, True), (50, 40, False), (0, 0, False)])
