@@ -1,19 +1,16 @@
 """Environment variables, streams and settings of other programs are inputs: they do not matter, or get one line."""
 
 import itertools
-import os
 import shutil
-import subprocess
-import sys
-from pathlib import Path
 
 import gymnasium
 import jax
 import matplotlib as mpl
 import pytest
 from support.refusals import assert_message_names
+from support.surroundings import COMMANDS, ENVIRONMENTS, find_fault, run_jaxnav, try_command
 from support.tiers import params_by_tier
-from support.tiny_run import finished_run, tiny_config, write_config
+from support.tiny_run import finished_run, tiny_config
 
 import jaxnav
 from jaxnav.__main__ import main
@@ -24,25 +21,6 @@ from jaxnav.errors import InputError
 from jaxnav.training.devices import require_float32
 from jaxnav.viz.learning import learning_figure
 from jaxnav.viz.style import save_figure
-
-REPOSITORY = Path(__file__).parents[2]
-
-
-def run_jaxnav(*words, redirection="", timeout=300, **environment):
-    """Run a command in a shell, with variables of the environment, and return exit code and output."""
-    command = [sys.executable, "-m", "jaxnav", *map(str, words)]
-    shell_line = f'exec "$@" {redirection}'
-    variables = {name: value for name, value in (os.environ | environment).items() if value is not None}
-    process = subprocess.run(
-        ["sh", "-c", shell_line, "sh", *command],
-        env=variables | {"PYTHONPATH": str(REPOSITORY)},
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        errors="replace",
-        timeout=timeout,
-    )
-    return process.returncode, process.stdout + process.stderr
 
 
 @pytest.fixture
@@ -171,68 +149,30 @@ def test_characters_that_a_stream_lacks_are_escaped():
     assert "k\\xfcche" in output
 
 
-# The matrix: commands by environments
+# The matrix: commands by environments; `python -m support.surroundings` in `tests` prints the whole
 
-ENVIRONMENTS = {
-    "usual": {},
-    "64 bits": {"JAX_ENABLE_X64": "1"},
-    "NaN": {"JAX_DEBUG_NANS": "1"},
-    "no jit": {"JAX_DISABLE_JIT": "1"},
-    "no backend": {"JAX_PLATFORMS": "no_such_backend"},
-    "no home": {"HOME": None},
-    "home that cannot be written": {"HOME": "/proc/nothing"},
-    "matplotlib": {"MATPLOTLIBRC": "matplotlibrc"},
-    "matplotlib backend": {"MPLBACKEND": "module://no_such"},
-    "ASCII": {"PYTHONIOENCODING": "ascii"},
-    "C locale": {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"},
-    "dumb": {"TERM": "dumb"},
-    "no terminal": {"TERM": None},
-    "one column": {"COLUMNS": "1"},
-    "many columns": {"COLUMNS": "100000"},
-    "bad columns": {"COLUMNS": "x"},
-    "no color": {"NO_COLOR": "1"},
-    "color": {"FORCE_COLOR": "1"},
-    "optimized": {"PYTHONOPTIMIZE": "2"},
-    "no input": {"redirection": "<&-"},
-    "no output": {"redirection": ">&- 2>&-"},
-}
-COMMANDS = {
-    "list": ("list", "worlds"),
-    "show": ("scenes", "show", "rooms", "--out", "scene.png"),
-    "play": ("play",),
-    "eval": ("eval", "finished", "--episodes", "2"),
-    "train": ("train", "--config", "tiny.yaml", "--run-dir", "run", "--seeds", "1", "--arms", "baseline"),
-    "report": ("report", "finished", "--episodes", "20"),
-}
 #: Each environment once; only commands that take a second.
 SAMPLE = list(zip(ENVIRONMENTS, itertools.cycle(["list", "list", "play"]), strict=False))
 #: Commands that compute, draw or write, each in the environment that matters most to it.
 COMPUTING = [("64 bits", "eval"), ("no home", "show")]
 
 
-def check_surroundings(environment_name, command_name, folder, monkeypatch):
-    """Check that a command in an environment ends well or with one line, and writes pictures as PNG."""
-    monkeypatch.chdir(folder)
-    write_config(folder)
-    (folder / "matplotlibrc").write_text("text.usetex: True\nsavefig.format: pdf\n")
-    code, output = run_jaxnav(*COMMANDS[command_name], timeout=240, **ENVIRONMENTS[environment_name])
-    assert code in (0, 2), output
-    assert "Traceback" not in output
-    assert code == 0 or "error: " in output or environment_name == "no output"
-    for picture in folder.rglob("*.png"):
-        assert picture.read_bytes().startswith(b"\x89PNG")
+def check(environment_name, command_name, folder):
+    """Check that a command in an environment ends well or with one line."""
+    attempt = try_command(environment_name, command_name, folder)
+    assert find_fault(environment_name, attempt, folder) is None, attempt.output
 
 
 @pytest.mark.parametrize(("environment_name", "command_name"), params_by_tier(SAMPLE, fast=SAMPLE[::4], slow=SAMPLE))
-def test_surroundings_by_a_sample(environment_name, command_name, tmp_path, monkeypatch):
-    check_surroundings(environment_name, command_name, tmp_path, monkeypatch)
+def test_surroundings_by_a_sample(environment_name, command_name, tmp_path):
+    check(environment_name, command_name, tmp_path)
 
 
 @pytest.mark.parametrize(
     ("environment_name", "command_name"),
     params_by_tier(itertools.product(ENVIRONMENTS, COMMANDS), slow=COMPUTING),
 )
-def test_surroundings_of_every_command(environment_name, command_name, tmp_path, tmp_path_factory, monkeypatch):
+def test_surroundings_of_every_command(environment_name, command_name, tmp_path, tmp_path_factory):
     if command_name in ("eval", "report"):
         shutil.copytree(finished_run(tmp_path_factory)[1], tmp_path / "finished")
-    check_surroundings(environment_name, command_name, tmp_path, monkeypatch)
+    check(environment_name, command_name, tmp_path)
