@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 from _flops import matmul_flops
 from jax.sharding import Mesh
-from rich.console import Console
 
 from jaxnav.env.objectnav import NUM_PRIORS, EnvParams
 from jaxnav.layout import ESTIMATORS, EstimatorConfig
+from jaxnav.plain_console import PlainConsole
 from jaxnav.policies.method import Knowledge
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.train import explore_world, learn_knowledge, make_trainer
@@ -58,7 +58,7 @@ def set_up_training(config: RunConfig, mesh: Mesh | None = None, explore: bool =
       mesh: of devices; None for one device.
       explore: walk through the scenes for the layout priors; otherwise all pairs of categories are equally likely.
     """
-    world = compile_training_world(config, Console(quiet=True))
+    world = compile_training_world(config, PlainConsole(quiet=True))
     estimator_config = ESTIMATORS[config.layout.setting]
 
     # Without exploration all counts are zero.

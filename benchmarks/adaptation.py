@@ -22,11 +22,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from _common import print_report
-from rich.console import Console
 
 import jaxnav
 from jaxnav.env.objectnav import EnvParams
 from jaxnav.evaluation.statistics import paired_difference
+from jaxnav.plain_console import PlainConsole
 from jaxnav.policies.adaptation import WINDOW, FastWeights, HasLearnedLoss, LearnedLossAdaptation, replay_window
 from jaxnav.policies.agent_loop import Agent, AgentLoop, policy_memory
 from jaxnav.policies.method import Knowledge
@@ -80,7 +80,7 @@ def stack_outcomes(results: Results, row_index: int) -> np.ndarray:
 def percent_falling(run: jaxnav.Run) -> list[float]:
     """Return the percentage of windows whose loss falls, for each seed."""
     policies = run.policies()
-    world = compile_evaluation_world(run.config, "val", None, None, Console(quiet=True))
+    world = compile_evaluation_world(run.config, "val", None, None, PlainConsole(quiet=True))
     agent_loop = dataclasses.replace(policies.make_agent_loop(world), estimator_config=None)
     arm_params = policies.arm_params("baseline")
 

@@ -30,7 +30,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from _common import print_report
-from rich.console import Console
 
 from jaxnav.choices import EstimatorName, ShiftKind
 from jaxnav.errors import InputError
@@ -38,6 +37,7 @@ from jaxnav.evaluation.episodes import join_episode_lists
 from jaxnav.evaluation.grid import Evaluator, episode_metrics
 from jaxnav.evaluation.statistics import Clusters, Interval, mean_interval, paired_difference
 from jaxnav.evaluation.variants import EvaluationRow, table_row
+from jaxnav.plain_console import PlainConsole
 from jaxnav.policies.methods.belief import TargetControl
 from jaxnav.policies.methods.belief_map import RADII
 from jaxnav.policies.methods.map_tracker import SQUARE_CELLS
@@ -77,7 +77,7 @@ def main(
         run = Run.open(run_dir)
         policies = run.policies(("layout",)).with_estimator(gap)
         for shift in shifts:
-            console = Console(stderr=True)
+            console = PlainConsole(stderr=True)
             config = run.config
             if has_perfect_detector:
                 config = dataclasses.replace(config, detector=PERFECT_DETECTOR)

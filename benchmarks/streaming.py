@@ -12,9 +12,9 @@ import time
 
 import jax
 from _common import peak_resident_gb, print_report, ratio_by_turn, steps_per_second, time_in_turns
-from rich.console import Console
 
 from jaxnav.layout import ESTIMATORS
+from jaxnav.plain_console import PlainConsole
 from jaxnav.runs.config import RunConfig, WorldConfig
 from jaxnav.runs.train import explore_world, learn_knowledge, make_trainer
 from jaxnav.runs.worlds import compile_training_world, draw_bank_order, prefetch_env_params
@@ -32,7 +32,7 @@ def main() -> None:
 
     # Compile the houses; rooms are counted in a sample of them.
     start_time = time.perf_counter()
-    world = compile_training_world(config, Console(stderr=True))
+    world = compile_training_world(config, PlainConsole(stderr=True))
     compile_s = time.perf_counter() - start_time
     assert isinstance(world.banks, Shards)
     disk_bytes = sum(file.stat().st_size for path in world.banks.paths for file in path.rglob("*"))

@@ -14,12 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from _common import print_report, ratio_by_turn, summarize, time_call, time_in_turns
 from _setup import set_up_training
-from rich.console import Console
 
 from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.evaluation.grid import EpisodeOutcome, Evaluator
 from jaxnav.evaluation.removal import InferenceConfig
 from jaxnav.evaluation.variants import inference_grid, table_row
+from jaxnav.plain_console import PlainConsole
 from jaxnav.policies.agent_loop import AgentLoop
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.worlds import compile_evaluation_world
@@ -35,7 +35,7 @@ NUM_COMPILED_CELLS = 2
 
 
 def main() -> None:
-    console = Console(stderr=True)
+    console = PlainConsole(stderr=True)
 
     # Train the seeds for one chunk.
     config = dataclasses.replace(RunConfig(), arms=(ARM,), seeds=NUM_SEEDS, chunk=NUM_UPDATES)

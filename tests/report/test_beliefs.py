@@ -1,5 +1,7 @@
 """Heat maps of the belief: those of the pictures of a search, over the squares of the home."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -48,7 +50,7 @@ def episode():
     zeros = np.zeros(NUM_STEPS, np.float32)
     removal_weight = np.linspace(0.2, 0.9, NUM_STEPS).astype(np.float32)
     layout_weights = np.ones((NUM_STEPS, len(CATEGORIES)), np.float32)
-    inferred = InferenceTrace(layout_weights, zeros, removal_weight, choices, choices, choices)
+    inferred: Any = InferenceTrace._make((layout_weights, zeros, removal_weight, choices, choices, choices))
     places = cell_centres(CORRIDOR, standable_cells(CORRIDOR.reach))
     return PlayedEpisode(
         trace=EpisodeTrace(poses, np.full(NUM_STEPS, MOVE_AHEAD), inferred, success=False),

@@ -3,13 +3,13 @@
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 from support.tiny_run import draw_run, tiny_config
 
+from jaxnav.plain_console import PlainConsole
 from jaxnav.report.config import ReportConfig
 from jaxnav.report.make import measure_shifts
 
-QUIET = Console(quiet=True)
+QUIET = PlainConsole(quiet=True)
 NUM_REPLAYS = 5
 pytestmark = pytest.mark.slow
 

@@ -4,7 +4,6 @@ import dataclasses
 
 import chex
 import pytest
-from rich.console import Console
 from support.stopping import train_in_two
 from support.tiers import params_by_tier
 from support.tiny_run import tiny_config
@@ -12,6 +11,7 @@ from support.tiny_run import tiny_config
 import jaxnav
 from jaxnav.__main__ import main
 from jaxnav.errors import InputError
+from jaxnav.plain_console import PlainConsole
 from jaxnav.policies.methods import find_method
 from jaxnav.runs.config import ARMS, FITTED_STEPS, RunConfig, check_config
 from jaxnav.runs.train import train, warn_if_rollout_too_short
@@ -89,9 +89,9 @@ def test_custom_edges_must_match_the_categories_of_the_world(tmp_path, monkeypat
 def test_train_warns_of_rollouts_shorter_than_a_macro_step(rollout, is_warned, tmp_path, capsys):
     config = dataclasses.replace(tiny_config(tmp_path), method="semexp", method_sizes={})
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, rollout=rollout))
-    warn_if_rollout_too_short(config, Console(width=200))
+    warn_if_rollout_too_short(config, PlainConsole(width=200))
     assert ("give --ppo.rollout 50 or more" in capsys.readouterr().out) == is_warned
-    warn_if_rollout_too_short(dataclasses.replace(config, method="org"), Console())
+    warn_if_rollout_too_short(dataclasses.replace(config, method="org"), PlainConsole())
     assert capsys.readouterr().out == ""
 
 

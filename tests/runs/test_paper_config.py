@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rich.console import Console
 from support.tiny_run import draw_run, tiny_config
 from twins.perception import TwinPaperBelief
 
@@ -16,6 +15,7 @@ import jaxnav
 from jaxnav.env.objectnav import EnvParams, ObjectNav, Observation
 from jaxnav.errors import InputError
 from jaxnav.layout import ESTIMATORS, EstimatorConfig, LayoutEstimator
+from jaxnav.plain_console import PlainConsole
 from jaxnav.policies.agent_loop import Perception
 from jaxnav.policies.features import unpack_features
 from jaxnav.policies.method import Knowledge, Percept
@@ -82,7 +82,7 @@ def paper_world() -> PaperWorld:
     layout = dataclasses.replace(config.layout, walks=24, steps=40)
     worlds = dataclasses.replace(config.worlds, num_train=4)
     config = check_config(dataclasses.replace(config, layout=layout, worlds=worlds))
-    console = Console(quiet=True)
+    console = PlainConsole(quiet=True)
     world = compile_training_world(config, console)
     exploration = training.explore_world(config, world)
     estimator = training.calibrate_estimator(config, world, exploration, console)

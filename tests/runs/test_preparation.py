@@ -8,12 +8,12 @@ import chex
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rich.console import Console
 from support.tiny_run import DRAWN_ESTIMATOR
 
 import jaxnav.runs.train as training
 from jaxnav.errors import InputError
 from jaxnav.gaps import CooccurrenceEvidence
+from jaxnav.plain_console import PlainConsole
 from jaxnav.policies.method import Knowledge
 from jaxnav.runs.preparation import Preparation, has_preparation, load_preparation, save_preparation
 from jaxnav.store.files import make_manifest
@@ -71,7 +71,7 @@ def test_training_learns_a_damaged_preparation_again(tmp_path, config, monkeypat
         monkeypatch.setattr(training, name, lambda *_, result=result: result)
     output = io.StringIO()
     run_config = dataclasses.replace(config, run_dir=tmp_path)
-    training.prepare_training(run_config, NO_WORLD, MANIFEST, Console(file=output, width=500))
+    training.prepare_training(run_config, NO_WORLD, MANIFEST, PlainConsole(file=output, width=500))
     assert f"{tmp_path / 'knowledge'}: is damaged, so it is learned again" in output.getvalue()
     assert damaged_file.read_bytes() == intact_content
 
@@ -85,5 +85,5 @@ def test_training_reads_a_preparation_instead_of_learning_it(tmp_path, config, m
     for name in ("explore_world", "calibrate_estimator", "learn_knowledge"):
         monkeypatch.setattr(training, name, refuse_to_learn)
     run_config = dataclasses.replace(config, run_dir=tmp_path)
-    preparation = training.prepare_training(run_config, NO_WORLD, MANIFEST, Console(quiet=True))
+    preparation = training.prepare_training(run_config, NO_WORLD, MANIFEST, PlainConsole(quiet=True))
     chex.assert_trees_all_equal(preparation.knowledge, KNOWLEDGE, strict=True)

@@ -5,9 +5,9 @@ import io
 import math
 
 import pytest
-from rich.console import Console
 from rich.text import Text
 
+from jaxnav.plain_console import PlainConsole
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.train import ProgressDisplay, mark_undefined_means, warn_if_more_steps
 from jaxnav.store.files import append_log_rows, read_log_rows
@@ -18,7 +18,7 @@ def test_bar_and_both_times_fit_80_columns(num_skipped):
     config = dataclasses.replace(RunConfig(), total_steps=5_000_000)  # four digits of updates
     metrics = [{"success": 0.876, "skipped_steps": num_skipped}]
     output = io.StringIO()
-    console = Console(file=output, force_terminal=True, width=80)
+    console = PlainConsole(file=output, force_terminal=True, width=80)
     with ProgressDisplay(config, 0, console) as progress:
         progress.stop_timing()
         progress.show_chunk({"baseline": metrics, "layout": metrics}, config.total_updates - config.chunk)
@@ -38,7 +38,7 @@ def test_success_without_an_episode_that_ended_is_undefined():
         "baseline": [{"success": math.nan, "skipped_steps": 0}, {"success": 0.5, "skipped_steps": 0}],
         "layout": [{"success": math.nan, "skipped_steps": 0}] * 2,
     }
-    with ProgressDisplay(config, 0, Console(file=output, width=200)) as progress:
+    with ProgressDisplay(config, 0, PlainConsole(file=output, width=200)) as progress:
         progress.stop_timing()
         progress.show_chunk(metrics, config.total_updates)
     assert "training SR: baseline 50 %, layout undefined (no episode ended)" in output.getvalue()
@@ -60,7 +60,9 @@ def test_steps_beyond_those_asked_for_are_printed():
     chunk_steps = RunConfig().chunk * RunConfig().steps_per_update
     for total_steps, is_printed in ((chunk_steps, False), (chunk_steps - 1, False), (chunk_steps + 1, True)):
         output = io.StringIO()
-        warn_if_more_steps(dataclasses.replace(RunConfig(), total_steps=total_steps), Console(file=output, width=200))
+        warn_if_more_steps(
+            dataclasses.replace(RunConfig(), total_steps=total_steps), PlainConsole(file=output, width=200)
+        )
         printed = output.getvalue()
         assert bool(printed) == is_printed
         assert not is_printed or f"{2 * chunk_steps:,}" in printed

@@ -5,10 +5,10 @@ import io
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 import jaxnav
 from jaxnav.evaluation.variants import EvaluationRow
+from jaxnav.plain_console import PlainConsole
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.evaluate import evaluate_rows
 from jaxnav.runs.train import _make_validator, make_trainer, train
@@ -18,7 +18,7 @@ from jaxnav.scenes.files.scene_file import write_scenes
 from jaxnav.scenes.worlds import make_generated_scenes
 from jaxnav.training.config import PPOConfig
 
-QUIET = Console(quiet=True)
+QUIET = PlainConsole(quiet=True)
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +125,7 @@ def test_train_without_val_scenes_exports_the_last_policy(config, tmp_path):
     scenes = tmp_path / "train_only.jsonl"
     write_scenes(scenes, [make_generated_scenes("rooms", "train", 2)[i] for i in range(2)])
     output = io.StringIO()
-    console = Console(file=output, width=400)
+    console = PlainConsole(file=output, width=400)
     run = train(dataclasses.replace(config, run_dir=tmp_path / "run", scenes=scenes, validations=1), console)
     assert "no val scenes, so the policies of the last update are exported" in output.getvalue()
     assert run.success_by_budget() is None
