@@ -176,9 +176,9 @@ def _draw_interval(value: Interval, axis: tuple[float, float]) -> str:
     if start < 0 < end:
         shapes.append(f'<rect class="zero" x="{place(0) - 0.25}" width="0.5" height="8"/>')
     if value.has_bounds:
-        left = place(value.low)
-        width = max(place(value.high) - left, 0.5)
-        shapes.append(f'<rect class="bounds" x="{left}" y="2" width="{width}" height="4"/>')
+        left_edge = place(value.low)
+        width = max(place(value.high) - left_edge, 0.5)
+        shapes.append(f'<rect class="bounds" x="{left_edge}" y="2" width="{width}" height="4"/>')
     if value.mean == value.mean:  # not NaN
         shapes.append(f'<rect class="mean" x="{place(value.mean) - 0.5}" width="1" height="8"/>')
     return f'<svg viewBox="0 0 100 8" preserveAspectRatio="none" aria-hidden="true">{"".join(shapes)}</svg>'
