@@ -17,6 +17,7 @@ import sys
 import tempfile
 import textwrap
 import threading
+import warnings
 import weakref
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -379,6 +380,8 @@ def _silence_libraries() -> Iterator[None]:
                 _failed_threads.add(thread)
         for logger in loggers:
             logger.addFilter(_is_no_late_error)  # adds it once
+        # Orbax drops the coroutines of arrays that it did not reach.
+        warnings.filterwarnings("ignore", r"coroutine .* was never awaited", RuntimeWarning)
         raise
     finally:
         for logger, saved_level in zip(loggers, saved_levels, strict=True):
