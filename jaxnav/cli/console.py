@@ -1,8 +1,8 @@
 """Parts shared by all commands: running one, printing text and tables, parsing options, caching compiled programs.
 
 `run_command` turns the errors of a command into one-line messages and exit codes, and `print_table` fits a table to the
-terminal. `parse_config` and `parse_arguments` build dataclasses of
-settings from a command line, with and without `--config`.
+terminal. `parse_config` and `parse_arguments` build dataclasses of settings from a command line, with and without
+`--config`.
 
 No module of `jaxnav.cli` imports JAX, Flax or SciPy at its top, so that help, completion and refusals of bad options
 take less than a second. A command imports what it runs inside its function.

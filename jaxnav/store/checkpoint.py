@@ -380,7 +380,8 @@ def _silence_libraries() -> Iterator[None]:
                 _failed_threads.add(thread)
         for logger in loggers:
             logger.addFilter(_is_no_late_error)  # adds it once
-        # Orbax drops the coroutines of arrays that it did not reach.
+        # Orbax drops the coroutines of arrays that it did not reach. Python's warning does not say whose they are, so
+        # the warnings about coroutines of others are silenced, too.
         warnings.filterwarnings("ignore", r"coroutine .* was never awaited", RuntimeWarning)
         raise
     finally:
