@@ -1,14 +1,15 @@
 """Value of experience to the search by belief, and what removal makes of it under a shift.
 
 `python benchmarks/belief_search.py RUN [RUN ...] [--split val] [--episodes 240] [--shift 0 1] [--shift-by context]
-[--gap surprise] [--ablations] [--perfect-detector]` evaluates runs of the method `belief`, or of a method with another
-predictor, with best actions on equal episodes. Rows of each run:
+[--gap surprise] [--rows layout sTDE mixture] [--ablations] [--perfect-detector]` evaluates runs of the method `belief`,
+or of a method with another predictor, with best actions on equal episodes. Rows of each run:
 
   nearest  the local policy alone, which walks to the nearest unexplored cell
   flat     all squares are equally likely, except for looks in vain
   places   complete removal of experience (eq. 1): the search by places alone
   layout   the complete belief
   sTDE     removal by eq. 2 in the paper's form with epsilon 0, weighed by the gap of `--gap`
+  mixture  the mixture of both beliefs (`--form mixture`), weighed by the same gap
 
 With `--ablations` also the complete belief without some of its parts, which are not fitted anew: `no looks`, without
 looks in vain; `no categories within R m`, for each radius of `LogLinear`; and `no categories`, with the floor alone by
@@ -56,8 +57,18 @@ PAIRS = (
     ("places", "layout"),
     ("layout", "sTDE"),
     ("places", "sTDE"),
+    ("layout", "mixture"),
+    ("sTDE", "mixture"),
 )
 BUDGETS = (50, 150)
+#: Rows of the complete belief and of its removals, by name.
+BELIEF_ROWS = {
+    "places": table_row("tde", None, None, "argmax"),
+    "layout": table_row("layout", None, None, "argmax"),
+    "sTDE": table_row("stde", 0.0, "paper", "argmax"),
+    "mixture": table_row("stde", 0.0, "mixture", "argmax"),
+}
+ROW_NAMES = ("nearest", "flat", *BELIEF_ROWS)
 #: Metrics [S, E] by name.
 Metrics = dict[str, np.ndarray]
 
@@ -69,6 +80,7 @@ def main(
     shifts: Sequence[float],
     shift_by: ShiftKind,
     gap: EstimatorName,
+    row_names: Sequence[str],
     has_ablations: bool,
     has_perfect_detector: bool,
 ) -> None:
@@ -82,44 +94,48 @@ def main(
             if has_perfect_detector:
                 config = dataclasses.replace(config, detector=PERFECT_DETECTOR)
             world = compile_evaluation_world(config, split, None, shift, console, shift_by=shift_by)
-            result = measure_run(policies, world, num_episodes, has_ablations)
+            result = measure_run(policies, world, num_episodes, row_names, has_ablations)
             result |= {"run": Path(run_dir).name, "method": run.config.method, "shift": shift}
             print(format_table(result), file=sys.stderr, flush=True)
             results.append(result)
-    settings = {"split": split, "episodes": num_episodes, "shift_by": shift_by, "gap": gap}
+    settings = {"split": split, "episodes": num_episodes, "shift_by": shift_by, "gap": gap, "rows": list(row_names)}
     settings["perfect_detector"] = has_perfect_detector
     print_report(settings | {"results": results})
 
 
-def measure_run(policies: Policies, world: CompiledWorld, num_episodes: int, has_ablations: bool) -> dict[str, Any]:
-    """Measure all rows of a run in one world.
+def measure_run(
+    policies: Policies, world: CompiledWorld, num_episodes: int, row_names: Sequence[str], has_ablations: bool
+) -> dict[str, Any]:
+    """Measure rows of a run in one world.
 
     Args:
       policies: policies of the arm `layout`, one for each fit.
       world: compiled scenes.
       num_episodes: number of episodes.
+      row_names: rows to measure, among `ROW_NAMES`.
       has_ablations: whether the search without some of its parts is measured too.
     """
-    layout_row = table_row("layout", None, None, "argmax")
-    belief_rows = {
-        "places": table_row("tde", None, None, "argmax"),
-        "layout": layout_row,
-        "sTDE": table_row("stde", 0.0, "paper", "argmax"),
-    }
+    layout_row = BELIEF_ROWS["layout"]
     evaluator = Evaluator(policies.make_agent_loop(world), has_controls=False)
+    metrics: dict[str, Metrics] = {}
 
     # The nearest frontier does not depend on the fit.
-    nearest_policies = with_control(policies, use_nearest_frontier=True)
-    nearest_policies = nearest_policies._replace(params=jax.tree.map(lambda leaf: leaf[:1], policies.params))
-    metrics, clusters = measure_rows({"nearest": layout_row}, nearest_policies, world, num_episodes)
-    for metric, values in metrics["nearest"].items():
-        metrics["nearest"][metric] = np.repeat(values, policies.num_seeds, axis=0)
+    if "nearest" in row_names:
+        nearest_policies = with_control(policies, use_nearest_frontier=True)
+        nearest_policies = nearest_policies._replace(params=jax.tree.map(lambda leaf: leaf[:1], policies.params))
+        nearest_metrics, _ = measure_rows({"nearest": layout_row}, nearest_policies, world, num_episodes)
+        metrics["nearest"] = {}
+        for metric, values in nearest_metrics["nearest"].items():
+            metrics["nearest"][metric] = np.repeat(values, policies.num_seeds, axis=0)
 
     # Rows of other parameters share the compilation.
-    flat_policies = with_zeros(policies, "places", "method")
-    metrics |= measure_rows({"flat": layout_row}, flat_policies, world, num_episodes, evaluator)[0]
-    metrics |= measure_rows(belief_rows, policies, world, num_episodes, evaluator)[0]
-    pairs = list(PAIRS)
+    if "flat" in row_names:
+        flat_policies = with_zeros(policies, "places", "method")
+        metrics |= measure_rows({"flat": layout_row}, flat_policies, world, num_episodes, evaluator)[0]
+    belief_rows = {name: row for name, row in BELIEF_ROWS.items() if name == "layout" or name in row_names}
+    belief_metrics, clusters = measure_rows(belief_rows, policies, world, num_episodes, evaluator)
+    metrics |= belief_metrics
+    pairs = [pair for pair in PAIRS if set(pair) <= set(metrics)]
     if has_ablations:
         for name, ablated_policies in ablate(policies).items():
             metrics |= measure_rows({name: layout_row}, ablated_policies, world, num_episodes, evaluator)[0]
@@ -206,7 +222,7 @@ def summarize(metrics: Mapping[str, Metrics], clusters: Clusters, pairs: Sequenc
 
 def format_table(result: dict[str, Any]) -> str:
     """Return the results of a run in one world in Markdown."""
-    names = list(result["rows"]["layout"])
+    names = list(next(iter(result["rows"].values())))
     title = f"{result['run']}, shift {result['shift']:g}"
     lines = [f"| {title} | {' | '.join(name.upper() for name in names)} |", "| --- |" + " ---: |" * len(names)]
     for label, row in (result["rows"] | result["differences"]).items():
@@ -224,6 +240,7 @@ if __name__ == "__main__":
     parser.add_argument("--shift", type=float, nargs="+", default=[0.0, 1.0])
     parser.add_argument("--shift-by", choices=get_args(ShiftKind), default="context")
     parser.add_argument("--gap", choices=get_args(EstimatorName), default="surprise")
+    parser.add_argument("--rows", choices=ROW_NAMES, nargs="+", default=list(ROW_NAMES), help="always with `layout`")
     parser.add_argument("--ablations", action="store_true")
     parser.add_argument("--perfect-detector", action="store_true")
     options = parser.parse_args()
@@ -235,6 +252,7 @@ if __name__ == "__main__":
             options.shift,
             options.shift_by,
             options.gap,
+            options.rows,
             options.ablations,
             options.perfect_detector,
         )

@@ -71,7 +71,8 @@ def removal_weight(gap: jax.Array, epsilon: jax.Array | float, form: Form = "res
     Args:
       gap: float32 [...], layout gap D in [0, 1].
       epsilon: scalar or [...], threshold; may be traced. At 1 or more the weight is 0.
-      form: `paper` and `residual` weigh by ReLU(D - epsilon), `switch` by 1 where D > epsilon and by 0 elsewhere.
+      form: `paper`, `residual` and `mixture` weigh by ReLU(D - epsilon), `switch` by 1 where D > epsilon and by 0
+        elsewhere.
 
     Returns:
       float32 [...], in [0, 1].
@@ -105,7 +106,8 @@ def stde(
       form: with s = `removal_weight`,
         `paper` and `switch`: a - s a_bar, which is `tde` at s = 1;
         `residual`: (1 + s) a - s a_bar, whose coefficients add up to 1, so that logits keep their scale. It ranks
-        actions as the paper's form does with the weight s / (1 + s).
+        actions as the paper's form does with the weight s / (1 + s);
+        `mixture`: log[(1 - s) softmax(a) + s softmax(a - a_bar)], the policy that follows `tde` with probability s.
 
     Returns:
       float [..., A], bit-identical to `logits` where s is 0.
@@ -114,8 +116,11 @@ def stde(
       ValueError: unknown form.
     """
     s = removal_weight(gap, epsilon, form)[..., None].astype(logits.dtype)
-    factual = (1 + s) * logits if form == "residual" else logits
-    effect = factual - s * counterfactual
+    if form == "mixture":
+        effect = _log_mixture(jax.nn.log_softmax(logits), jax.nn.log_softmax(tde(logits, counterfactual)), s)
+    else:
+        factual = (1 + s) * logits if form == "residual" else logits
+        effect = factual - s * counterfactual
     # Subtracting 0 * a_bar could still turn -0.0 into 0.0, so the factual logits are copied.
     return jnp.where(s == 0, logits, effect)
 
@@ -128,12 +133,15 @@ def remove_from_sum(
     With the logits a = direct + experience and the counterfactual logits a_bar = experience, this is a - s a_bar, the
     value of `stde` in the same form up to rounding. A weight s = 1 leaves eq. 1.
 
+    The form `mixture` is for scores that are log probabilities, up to a constant that both beliefs share: with the
+    beliefs exp(direct + experience) and exp(direct), it is log[(1 - s) exp(direct + experience) + s exp(direct)].
+
     Args:
       direct: float [..., A], scores without experience.
       experience: float [..., A], what experience adds to the scores; finite.
       gap: float32 [...], layout gap D in [0, 1].
       epsilon: scalar or [...], threshold; may be traced. At 1 or more nothing is removed.
-      form: `paper`, s = ReLU(D - epsilon), or `switch`, s = 1 where D > epsilon.
+      form: `paper` and `mixture`, s = ReLU(D - epsilon), or `switch`, s = 1 where D > epsilon.
 
     Returns:
       float [..., A], bit-identical to `direct` where s is 1, and to `direct + experience` where s is 0.
@@ -142,7 +150,14 @@ def remove_from_sum(
       ValueError: another form; `residual` rescales the direct scores, so it is no removal from a sum.
     """
     if form == "residual":
-        raise ValueError("form='residual': a sum keeps its direct scores as they are; choose paper or switch")
+        raise ValueError("form='residual': a sum keeps its direct scores as they are; choose paper, switch or mixture")
     s = removal_weight(gap, epsilon, form)[..., None].astype(direct.dtype)
+    remaining = _log_mixture(experience, jnp.zeros_like(experience), s) if form == "mixture" else (1 - s) * experience
+    scores = jnp.where(s == 0, direct + experience, direct + remaining)
     # Adding 0 * experience could still turn -0.0 into 0.0, so the direct scores are copied.
-    return jnp.where(s == 1, direct, direct + (1 - s) * experience)
+    return jnp.where(s == 1, direct, scores)
+
+
+def _log_mixture(log_a: jax.Array, log_b: jax.Array, weight_b: jax.Array) -> jax.Array:
+    """log[(1 - s) a + s b] from logarithms, with the weight s in [0, 1] of b."""
+    return jnp.logaddexp(jnp.log1p(-weight_b) + log_a, jnp.log(weight_b) + log_b)

@@ -6,7 +6,7 @@ The command line reads these types to show its help, so this module must not imp
 from typing import Literal
 
 #: Form in which equation 2 combines the logits, see `jaxnav.causal.stde`.
-Form = Literal["paper", "residual", "switch"]
+Form = Literal["paper", "residual", "switch", "mixture"]
 #: Reduction over the rows' divergences in eq. 5: the mean over visible rows, the mean over all K, or the sum.
 Reduction = Literal["mean_visible", "mean", "sum"]
 #: Counts of a view in eq. 3: 1 for each visible category, or the number of its visible instances.

@@ -12,7 +12,7 @@ from hypothesis import given
 
 from jaxnav.causal import do, removal_weight, remove_from_sum, stde, tde
 
-FORMS = ("paper", "residual", "switch")
+FORMS = ("paper", "residual", "switch", "mixture")
 SOFT = FORMS[:2]
 LOGITS = hnp.arrays(np.float32, (4, 6), elements=st.floats(-30, 30, width=32, allow_subnormal=False))
 #: Without subnormal numbers, which XLA takes for 0.
@@ -132,6 +132,17 @@ def test_constant_offsets_do_not_change_the_choice_of_stde(
     assert plain_logits.argmax() == moved_logits.argmax()
 
 
+@given(LOGITS, LOGITS, UNIT)
+def test_mixture_form_mixes_the_probabilities_of_two_decisions(factual, counterfactual, gap):
+    # At epsilon 0 the weight is the gap itself.
+    factual_policy = np.exp(factual - np.logaddexp.reduce(factual, axis=-1, keepdims=True))
+    direct = factual - counterfactual
+    direct_policy = np.exp(direct - np.logaddexp.reduce(direct, axis=-1, keepdims=True))
+    expected = (1 - gap) * factual_policy + gap * direct_policy
+    result = jax.nn.softmax(stde(jnp.asarray(factual), jnp.asarray(counterfactual), jnp.full(4, gap), 0.0, "mixture"))
+    np.testing.assert_allclose(result, expected, atol=1e-4)
+
+
 def test_stde_forms_agree_at_matching_weights():
     # (1 + s) a - s a_bar = (1 + s) (a - s / (1 + s) a_bar).
     factual, counterfactual = jax.random.normal(jax.random.key(0), (2, 50, 6))
@@ -169,6 +180,10 @@ def test_removal_from_a_sum_follows_worked_arithmetic():
     np.testing.assert_array_equal(remove_from_sum(direct, experience, gap, 0.5), [5.0, -0.625])
     np.testing.assert_array_equal(remove_from_sum(direct, experience, gap, 0.5, "switch"), direct)
 
+    # The mixture of beliefs e^2 e^4 and e^2 with the weights 0.75 and 0.25: 2 + log(0.75 e^4 + 0.25).
+    mixed = remove_from_sum(direct, experience, gap, 0.5, "mixture")
+    np.testing.assert_allclose(mixed, [5.71840, -0.60355], atol=1e-5)
+
 
 @given(direct=LOGITS, experience=LOGITS, gap=UNIT, epsilon=UNIT)
 def test_removal_from_a_sum_is_equation_2_of_the_paper(direct, experience, gap, epsilon):
@@ -184,12 +199,13 @@ def test_removal_from_a_sum_is_equation_2_of_the_paper(direct, experience, gap, 
 @given(direct=LOGITS, experience=LOGITS, gap=UNIT)
 def test_complete_removal_from_a_sum_leaves_the_direct_scores_and_epsilon_one_leaves_all(direct, experience, gap):
     gap = jnp.full(4, gap, jnp.float32)
-    without_experience = remove_from_sum(jnp.asarray(direct), jnp.asarray(experience), jnp.ones(4), 0.0)
-    np.testing.assert_array_equal(as_bits(without_experience), as_bits(direct))
-    complete = remove_from_sum(jnp.asarray(direct), jnp.asarray(experience), gap, 1.0)
-    np.testing.assert_array_equal(as_bits(complete), as_bits(direct + experience))
+    for form in ("paper", "switch", "mixture"):
+        without_experience = remove_from_sum(jnp.asarray(direct), jnp.asarray(experience), jnp.ones(4), 0.0, form)
+        np.testing.assert_array_equal(as_bits(without_experience), as_bits(direct))
+        complete = remove_from_sum(jnp.asarray(direct), jnp.asarray(experience), gap, 1.0, form)
+        np.testing.assert_array_equal(as_bits(complete), as_bits(direct + experience))
 
 
 def test_removal_from_a_sum_refuses_the_residual_form():
-    with pytest.raises(ValueError, match=r"residual.*paper or switch"):
+    with pytest.raises(ValueError, match=r"residual.*paper, switch or mixture"):
         remove_from_sum(jnp.zeros(1), jnp.zeros(1), jnp.float32(0), 0.5, "residual")

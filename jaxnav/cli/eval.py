@@ -52,7 +52,8 @@ class EvalConfig:
       form: rules by which sTDE removes experience. `paper` subtracts from the logits of the policy a share of the
         counterfactual logits (see `removal`); the share is the excess of the layout gap over the threshold. `residual`
         does this without changing the scale of the logits. `switch` subtracts these logits completely where the gap
-        exceeds the threshold. The default is the rule of the layout estimator, and `paper` with `--removal cde`.
+        exceeds the threshold. `mixture` mixes the probabilities of the decisions with and without experience, with the
+        same share. The default is the rule of the layout estimator, and `paper` with `--removal cde`.
       removal: decisions that are left when experience is removed. `tde`, the total direct effect (equation 1):
         subtracts the counterfactual logits, in which scene and goal are zero and experience is not. `cde`, the
         controlled direct effect: leads over to the decision of the same network without experience throughout the

@@ -54,7 +54,8 @@ class SweepConfig:
       form: rule by which sTDE removes experience. `paper` subtracts from the logits of the policy a share of the logits
         with scene and goal set to zero; the share is the excess of the layout gap over the threshold. `residual` does
         this without changing the scale of the logits. `switch` subtracts these logits completely where the gap exceeds
-        the threshold. The default is the rule of the layout estimator.
+        the threshold. `mixture` mixes the probabilities of the decisions with and without experience, with the same
+        share. The default is the rule of the layout estimator.
       setting: layout estimator or layout gap to use instead of that of the run or policy, for example `learned`, a gap
         that detects another layout; `jaxnav list settings` describes all.
       hold: keep the gap from falling within an episode. With `--form switch`, experience then stays removed for the

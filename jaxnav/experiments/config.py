@@ -70,7 +70,8 @@ class ExperimentConfig:
       form: rule by which sTDE removes experience. `paper` subtracts from the logits of the policy a share of the logits
         with scene and goal set to zero; the share is the excess of the layout gap over the threshold. `residual` does
         this without changing the scale of the logits. `switch` subtracts these logits completely where the gap exceeds
-        the threshold.
+        the threshold. `mixture` mixes the probabilities of the decisions with and without experience, with the same
+        share.
       decodings: rules that choose actions from logits, `argmax` (best actions) and `sample` (sampled actions). The
         measurements `mixture`, `handover` and `cde`, in which half of the episodes are in shifted homes, are repeated
         with each rule.

@@ -94,6 +94,7 @@ REMOVAL_RULES = (
     RemovalRule("evidence", False, StdeOptions(0.0, "paper")),
     RemovalRule("learned", False, StdeOptions(0.0, "paper")),
     RemovalRule("surprise", False, StdeOptions(0.0, "paper")),
+    RemovalRule("surprise", False, StdeOptions(0.0, "mixture")),
     RemovalRule("overdue", False, StdeOptions(0.0, "paper")),
     RemovalRule("evidence", True, StdeOptions(0.5, "switch")),
     RemovalRule("overdue", True, StdeOptions(0.5, "switch")),
@@ -104,6 +105,7 @@ REMOVAL_RULES = (
 CONTROLS_BY_FORM: Mapping[Form, tuple[TrialControl | GapSchedule, ...]] = {
     "residual": ("shuffled", "course"),
     "paper": ("shuffled", "course"),
+    "mixture": ("shuffled", "course"),
     "switch": ("shuffled",),
 }
 #: Control whose evidence has permuted categories, for the gaps that read evidence.

@@ -13,7 +13,7 @@ import pytest
 from support import tiny_world as tiny
 from support.scenes import BOOK, CATEGORIES, CHAIR, FRIDGE, corridor_scene
 
-from jaxnav.causal import do, stde, tde
+from jaxnav.causal import do, remove_from_sum, stde, tde
 from jaxnav.errors import InputError
 from jaxnav.evaluation.removal import apply_removal
 from jaxnav.evaluation.variants import inference_grid, table_row
@@ -258,6 +258,21 @@ def test_removal_from_target_scores_is_equation_2_in_its_paper_form():
     )
     np.testing.assert_array_equal(removed[3], tde(logits, counterfactual)[3])
     np.testing.assert_array_equal(weight, gap)
+
+
+def test_mixture_form_scores_targets_by_the_mixture_of_beliefs():
+    rng = np.random.default_rng(0)
+    log_places, log_layout, log_cost = rng.normal(size=(3, MAP_SQUARES, MAP_SQUARES)).astype(np.float32)
+    places_scores = score_targets(jnp.asarray(log_places), jnp.asarray(log_cost))
+    layout_scores = score_targets(jnp.asarray(log_layout), jnp.asarray(log_cost))
+    for gap in (0.0, 0.3, 1.0):
+        places_belief = np.exp(log_places) / np.exp(log_places).sum()
+        layout_belief = np.exp(log_layout) / np.exp(log_layout).sum()
+        mixed_belief = (1 - gap) * layout_belief + gap * places_belief
+        expected = score_targets(jnp.log(jnp.asarray(mixed_belief)), jnp.asarray(log_cost))
+        experience = layout_scores - places_scores
+        mixed = remove_from_sum(places_scores, experience, jnp.full(MAP_SQUARES, gap), 0.0, "mixture")
+        np.testing.assert_allclose(mixed, expected, atol=1e-4)
 
 
 def test_scores_are_computed_only_where_a_target_is_due():
