@@ -1,17 +1,21 @@
 """Train PPO of Stable-Baselines3 in generated rooms, and compare it with random actions.
 
 pip install '.[gym]' stable-baselines3
-python examples/stable_baselines3_ppo.py [STEPS]
+python examples/stable_baselines3_ppo.py                    # 400,000 steps
+python examples/stable_baselines3_ppo.py --steps 2000000 --benchmark    # also the rooms of the benchmark v1
 """
 
-import sys
+import argparse
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
+
+from jaxnav.runs.benchmark import run_benchmark
 
 ROOMS = "jaxnav.env.gym:jaxnav/rooms-v0"
 
@@ -59,6 +63,19 @@ class GymnasiumVecEnv(VecEnv):
         return [False] * self.num_envs
 
 
+class SampledActions:
+    """A model whose actions are sampled, as in training; `jaxnav.evaluate(model)` evaluates its best actions."""
+
+    def __init__(self, model: PPO) -> None:
+        self.model = model
+        self.observation_space = model.observation_space
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> Any:
+        return self.model.predict(observation, deterministic=False)
+
+
 def success_rate(env: VecEnv, choose_actions: Callable[[Any], np.ndarray], num_episodes: int = 1000) -> float:
     """Return the share of episodes that succeed, in percent."""
     observations = env.reset()
@@ -69,7 +86,7 @@ def success_rate(env: VecEnv, choose_actions: Callable[[Any], np.ndarray], num_e
     return 100 * float(np.mean(successes))
 
 
-def main(num_steps: int) -> None:
+def main(num_steps: int, has_benchmark: bool) -> None:
     train_env = GymnasiumVecEnv(gymnasium.make_vec(ROOMS, num_envs=64, split="train"))
     val_env = GymnasiumVecEnv(gymnasium.make_vec(ROOMS, num_envs=64, split="val"))
 
@@ -84,6 +101,15 @@ def main(num_steps: int) -> None:
     random_rate = success_rate(val_env, lambda _: rng.integers(0, 6, 64))
     print(f"random actions: {random_rate:.1f} %")
 
+    if has_benchmark:
+        score_file = Path("stable_baselines3_ppo.json")
+        run_benchmark(SampledActions(model), tracks=["rooms"]).write(score_file)
+        print(f"scores of the benchmark written to {score_file}")
+
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 400_000)
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--steps", type=int, default=400_000)
+    parser.add_argument("--benchmark", action="store_true")
+    options = parser.parse_args()
+    main(options.steps, options.benchmark)
