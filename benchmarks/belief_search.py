@@ -1,4 +1,4 @@
-"""Value of experience to the search by belief, and what removal makes of it under a shift.
+"""Value of experience to the search by belief, its cost under a layout shift, and the effect of removal.
 
 `python benchmarks/belief_search.py RUN [RUN ...] [--split val] [--episodes 240] [--shift 0 1] [--shift-by context]
 [--gap surprise] [--rows layout sTDE mixture] [--ablations] [--perfect-detector]` evaluates runs of the method `belief`,
@@ -12,7 +12,7 @@ or of a method with another predictor, with best actions on equal episodes. Rows
   mixture  the mixture of both beliefs (`--form mixture`), weighed by the same gap
 
 With `--ablations` also the complete belief without some of its parts, which are not fitted anew: `no looks`, without
-looks in vain; `no categories within R m`, for each radius of `LogLinear`; and `no categories`, with the floor alone by
+looks in vain; `no R m weights`, without the weights of one radius of `LogLinear`; and `no categories`, with the floor alone by
 goal. `plan for every action` is the complete belief with a new target after each action. With `--perfect-detector`, all
 rows are evaluated with a detector that makes no errors; the fits stay.
 
@@ -112,7 +112,7 @@ def measure_run(
       policies: policies of the arm `layout`, one for each fit.
       world: compiled scenes.
       num_episodes: number of episodes.
-      row_names: rows to measure, among `ROW_NAMES`.
+      row_names: rows to measure, among `ROW_NAMES`; `layout` is always measured.
       has_ablations: whether the search without some of its parts is measured too.
     """
     layout_row = BELIEF_ROWS["layout"]
@@ -181,7 +181,7 @@ def ablate(policies: Policies) -> dict[str, Policies]:
         for radius_index, radius in enumerate(RADII):
             radius_m = radius * SQUARE_CELLS * CELL_SIZE
             without_radius = relations.at[:, :, radius_index].set(0.0)
-            ablated_policies[f"no categories within {radius_m:g} m"] = _with_relations(policies, without_radius)
+            ablated_policies[f"no {radius_m:g} m weights"] = _with_relations(policies, without_radius)
         ablated_policies["no categories"] = _with_relations(policies, jnp.zeros_like(relations))
     return ablated_policies
 

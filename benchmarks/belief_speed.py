@@ -2,10 +2,10 @@
 
 `python benchmarks/belief_speed.py RUN [--episodes 256]` times in turns
 
-* 50 steps of parallel episodes with best actions and sTDE, for a run of the method `belief` and for the packaged
+* the first 50 steps of parallel episodes with best actions and sTDE, for a run of the method `belief` and for the packaged
   policy `houses-org`, in equal homes: environment steps per second, and their ratio;
-* one belief with its plan (both beliefs, the walking steps to all squares, the scores of all targets) on maps of
-  64 x 64 and 96 x 96 cells, one map at a time.
+* one plan (both beliefs, the walking steps to all squares, the scores of all targets) on maps of 64 x 64 and 96 x 96
+  random cells, one map at a time.
 """
 
 import argparse

@@ -1,19 +1,20 @@
 """How well predictors of the search by belief know where goals are, and how long they take.
 
-`python benchmarks/predictors.py RUN [--searches 256] [--steps 200]` fits predictors to the same searches in the
-training homes of a run of the method `belief`, and measures them on searches in its `val` homes. Rows: *places*,
-which no category changes; the packaged predictors `Dirichlet` and `LogLinear`; and `Convolution`, a small network
-over the same map, which is defined here.
+`python benchmarks/predictors.py RUN [--predictors LogLinear ...] [--penalty 0.0001]` fits predictors to the same
+searches in the training homes of a run of the method `belief`, and measures them on searches in its `val` homes: the
+packaged predictors `Dirichlet` and `LogLinear`, and `Convolution`, a small network over the same map, defined here.
 
-*Bits* is the information about a goal's squares beyond that of a flat belief that only looks in vain change, the mean
-over the goals that the map does not show yet. Intervals are over the searches, which share homes. *Microseconds* is the
-time of one belief on one map, in batches of 16, timed in turns.
+*Bits* is the information about a goal's squares beyond that of a flat belief that changes only by looks in vain: the
+mean over the unseen goals of each search, then over the searches that have any. *Places bits* is that of places alone,
+fitted in the same run, and *train bits* is the predictor's own in the training homes. Intervals are over searches,
+which share homes, so they are too narrow. *Microseconds* is the time of one belief on one map, in batches of 16, timed
+in turns.
 """
 
 import argparse
 import dataclasses
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -27,6 +28,7 @@ from jaxnav.errors import InputError
 from jaxnav.evaluation.statistics import mean_interval, scene_clusters
 from jaxnav.plain_console import PlainConsole
 from jaxnav.policies.agent_loop import AgentLoop
+from jaxnav.policies.methods import belief_fit
 from jaxnav.policies.methods.belief import Dirichlet, LogLinear, Predictor, TargetPolicy, make_belief_method
 from jaxnav.policies.methods.belief_fit import (
     Snapshots,
@@ -92,7 +94,9 @@ PREDICTORS: dict[str, type[Predictor]] = {
 }
 
 
-def main(run_dir: str, num_searches: int, num_steps: int) -> None:
+def main(run_dir: str, predictor_names: Sequence[str], penalty: float, num_searches: int, num_steps: int) -> None:
+    belief_fit.WEIGHT_PENALTY = penalty
+
     # Searches with a flat belief in training homes and in `val` homes, the same for all predictors.
     run = Run.open(run_dir)
     policies = run.policies(("layout",))
@@ -124,23 +128,31 @@ def main(run_dir: str, num_searches: int, num_steps: int) -> None:
 
     rows: dict[str, Any] = {}
     belief_calls = {}
-    for name, predictor in PREDICTORS.items():
+    for name in predictor_names:
         console.print(f"fitting {name} ...")
-        spec = dataclasses.replace(policies.spec, method=make_belief_method(predictor))
+        spec = dataclasses.replace(policies.spec, method=make_belief_method(PREDICTORS[name]))
         fitted_loop = dataclasses.replace(agent_loop, spec=spec)
         start_params = init_params(spec, key) | {"detection_rates": rates}
         params = fit_weights(fitted_loop, start_params, snapshots["train"], *goal_inputs, key)
 
         zeros = {group: jax.tree.map(jnp.zeros_like, params[group]) for group in ("places", "method")}
-        flat_losses, _ = measure_losses(fitted_loop, params | zeros, snapshots["val"], *goal_inputs, num_searches)
-        losses = measure_losses(fitted_loop, params, snapshots["val"], *goal_inputs, num_searches)
-        rows["places"] = make_row(flat_losses - losses[0], params["places"])
-        rows[name] = make_row(flat_losses - losses[1], params["method"])
+        bits = {}
+        for split, split_snapshots in snapshots.items():
+            flat_losses, _ = measure_losses(fitted_loop, params | zeros, split_snapshots, *goal_inputs, num_searches)
+            losses = measure_losses(fitted_loop, params, split_snapshots, *goal_inputs, num_searches)
+            bits[split] = [flat_losses - loss for loss in losses]
+        rows[name] = {
+            "bits": interval_over_searches(bits["val"][1]),
+            "places_bits": interval_over_searches(bits["val"][0]),
+            "train_bits": interval_over_searches(bits["train"][1]),
+            "parameters": sum(leaf.size for leaf in jax.tree.leaves(params["method"])),
+        }
         belief_calls[name] = make_belief_call(fitted_loop, params, snapshots["val"], *goal_inputs)
 
     for name, call_times in time_in_turns(belief_calls, TURNS).items():
         rows[name]["microseconds"] = summarize([1e6 * call_time / BATCH for call_time in call_times])
-    print_report({"run": Path(run_dir).name, "searches": num_searches, "steps": num_steps, "predictors": rows})
+    settings = {"run": Path(run_dir).name, "penalty": penalty, "searches": num_searches, "steps": num_steps}
+    print_report(settings | {"predictors": rows})
 
 
 def measure_losses(
@@ -151,7 +163,7 @@ def measure_losses(
     goal_weights: jax.Array,
     num_searches: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean negative log likelihoods of places and layout in each search, in bits."""
+    """Mean negative log likelihoods of places and layout in each search, in bits; NaN without an unseen goal."""
     policy: Any = agent_loop.bind(params)
     one_map = jax.jit(lambda snapshot: goal_losses(policy, snapshot, goals, goal_weights))
     places_loss, layout_loss, num_goals = jax.lax.map(one_map, snapshots, batch_size=BATCH)
@@ -161,15 +173,16 @@ def measure_losses(
     mean_losses = []
     for loss in (places_loss, layout_loss):
         total_loss = np.asarray(loss).reshape(-1, num_searches).sum(axis=0)
-        mean_losses.append(total_loss / np.maximum(total_goals, 1.0) / np.log(2))
+        mean_losses.append(np.where(total_goals > 0, total_loss, np.nan) / np.maximum(total_goals, 1.0) / np.log(2))
     return mean_losses[0], mean_losses[1]
 
 
-def make_row(bits: np.ndarray, params: Any) -> dict[str, Any]:
-    """Mean of one value for each search with its interval, and the number of parameters."""
-    clusters = scene_clusters(np.arange(len(bits)).astype(str), np.full(len(bits), ""))
-    interval = mean_interval(bits[None], clusters, trained=False)
-    return {"bits": interval.to_json(), "parameters": sum(leaf.size for leaf in jax.tree.leaves(params))}
+def interval_over_searches(bits: np.ndarray) -> dict[str, Any]:
+    """Mean of one value for each search, with its interval; searches without a value are NaN."""
+    counted_bits = bits[np.isfinite(bits)]
+    names = np.arange(len(counted_bits)).astype(str)
+    clusters = scene_clusters(names, np.full(len(names), ""))
+    return mean_interval(counted_bits[None], clusters, trained=False).to_json()
 
 
 def make_belief_call(
@@ -187,10 +200,12 @@ def make_belief_call(
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("run")
+    parser.add_argument("--predictors", choices=list(PREDICTORS), nargs="+", default=list(PREDICTORS))
+    parser.add_argument("--penalty", type=float, default=belief_fit.WEIGHT_PENALTY, help="of the squared weights")
     parser.add_argument("--searches", type=int, default=256)
     parser.add_argument("--steps", type=int, default=200)
     options = parser.parse_args()
     try:
-        main(options.run, options.searches, options.steps)
+        main(options.run, options.predictors, options.penalty, options.searches, options.steps)
     except InputError as error:
         sys.exit(f"error: {error}")

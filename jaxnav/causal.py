@@ -66,7 +66,7 @@ def tde(logits: jax.Array, counterfactual: jax.Array) -> jax.Array:
 
 
 def removal_weight(gap: jax.Array, epsilon: jax.Array | float, form: Form = "residual") -> jax.Array:
-    """Weight s of the removed logits in eq. 2.
+    """Removal weight s of eq. 2: that of the removed logits, or of the decision without experience in a mixture.
 
     Args:
       gap: float32 [...], layout gap D in [0, 1].
@@ -130,11 +130,11 @@ def remove_from_sum(
 ) -> jax.Array:
     """Equation 2 for scores that are a sum: direct + (1 - s) experience.
 
-    With the logits a = direct + experience and the counterfactual logits a_bar = experience, this is a - s a_bar, the
-    value of `stde` in the same form up to rounding. A weight s = 1 leaves eq. 1.
+    With the logits a = direct + experience and the counterfactual logits a_bar = experience, the forms `paper` and
+    `switch` equal `stde` in the same form up to rounding, a - s a_bar; with s = 1 they are `tde`.
 
-    The form `mixture` is for scores that are log probabilities, up to a constant that both beliefs share: with the
-    beliefs exp(direct + experience) and exp(direct), it is log[(1 - s) exp(direct + experience) + s exp(direct)].
+    The form `mixture` is log[(1 - s) exp(direct + experience) + s exp(direct)]. Unlike in `stde` the scores are not
+    normalized over the choices: they are log probabilities of detection per action, which both beliefs share.
 
     Args:
       direct: float [..., A], scores without experience.
@@ -159,5 +159,5 @@ def remove_from_sum(
 
 
 def _log_mixture(log_a: jax.Array, log_b: jax.Array, weight_b: jax.Array) -> jax.Array:
-    """log[(1 - s) a + s b] from logarithms, with the weight s in [0, 1] of b."""
+    """log[(1 - weight_b) a + weight_b b] from the logarithms of a and b, with weight_b in [0, 1]."""
     return jnp.logaddexp(jnp.log1p(-weight_b) + log_a, jnp.log(weight_b) + log_b)
