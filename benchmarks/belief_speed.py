@@ -2,8 +2,8 @@
 
 `python benchmarks/belief_speed.py RUN [--episodes 256]` times in turns
 
-* the first 50 steps of parallel episodes with best actions and sTDE, for a run of the method `belief` and for the packaged
-  policy `houses-org`, in equal homes: environment steps per second, and their ratio;
+* the first 50 steps of parallel episodes with best actions and sTDE, for a run of the method `belief` and for the
+  packaged policy `houses-org`, in equal homes: environment steps per second, and their ratio;
 * one plan (both beliefs, the walking steps to all squares, the scores of all targets) on maps of 64 x 64 and 96 x 96
   random cells, one map at a time.
 """
@@ -108,17 +108,17 @@ def make_plan_call(policies: Policies, size: int) -> Callable[[], Any]:
     cells |= np.where(rng.random(shape) < 1 / 50, category_bits, np.uint32(0))
     maps = jnp.asarray(cells, jnp.uint32)
     num_squares = size // SQUARE_CELLS
-    looks = jnp.asarray(rng.integers(0, 3, (NUM_MAPS, NUM_LOOK_DISTANCES, num_squares, num_squares)), jnp.uint8)
+    look_counts = jnp.asarray(rng.integers(0, 3, (NUM_MAPS, NUM_LOOK_DISTANCES, num_squares, num_squares)), jnp.uint8)
     policy: Any = bind(policies.spec, jax.tree.map(lambda leaf: leaf[0], policies.params))
 
     def score_map(one_map: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        cells, looks = one_map
-        beliefs = policy.log_beliefs(read_squares(cells, looks), jnp.int32(0), jnp.ones(num_categories))
+        cells, look_counts = one_map
+        beliefs = policy.log_beliefs(read_squares(cells, look_counts), jnp.int32(0), jnp.ones(num_categories))
         log_cost, _ = travel_costs(cells, jnp.full(2, size // 2, jnp.int32))
         return score_targets(beliefs.places, log_cost), score_targets(beliefs.layout, log_cost)
 
-    score_maps = jax.jit(lambda maps, looks: jax.lax.map(score_map, (maps, looks)))
-    return lambda: score_maps(maps, looks)
+    score_maps = jax.jit(lambda maps, look_counts: jax.lax.map(score_map, (maps, look_counts)))
+    return lambda: score_maps(maps, look_counts)
 
 
 if __name__ == "__main__":
