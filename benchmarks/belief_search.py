@@ -13,8 +13,8 @@ or of a method with another predictor, with best actions on equal episodes. Rows
 
 With `--ablations` also the complete belief without some of its parts, which are not fitted anew: `no looks`, without
 looks in vain; `no R m weights`, without the weights of one radius of `LogLinear`; and `no categories`, with the floor
-alone by goal. `plan for every action` is the complete belief with a new target after each action. With `--perfect-detector`, all
-rows are evaluated with a detector that makes no errors; the fits stay.
+alone by goal. `plan for every action` is the complete belief with a new target after each action. With
+`--perfect-detector`, all rows are evaluated with a detector that makes no errors; the fits stay.
 
 Intervals are over floor plans and fits; those of differences are also given for these fits alone, `(these fits)`. The
 result goes to stdout as JSON, the tables to stderr.
