@@ -87,8 +87,10 @@ def make_steps_call(policies: Policies, world: CompiledWorld, num_episodes: int)
         agent = agent_loop.start_from(start_states(episodes), memory, policies.knowledge, env_params)
 
         def step(agent: Any, _: None) -> tuple[Any, jax.Array]:
-            agent, result, _ = infer_and_act(config, context, agent, running, episode_keys, has_controls=False)
-            return agent, result.success
+            next_agent, result, _trace = infer_and_act(
+                config, context, agent, running, episode_keys, has_controls=False
+            )
+            return next_agent, result.success
 
         return jax.lax.scan(step, agent, None, length=NUM_STEPS)[1]
 

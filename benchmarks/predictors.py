@@ -103,12 +103,14 @@ def main(run_dir: str, predictor_names: Sequence[str], penalty: float, num_searc
     key = jax.random.key(run.config.seed)
     console = PlainConsole(stderr=True)
     snapshots = {}
+    look_counts = {}
+    agent_loops = {}
     for index, split in enumerate(("train", "val")):
         world = compile_evaluation_world(run.config, split, None, 0.0, console)
-        agent_loop = policies.make_agent_loop(world)
+        agent_loops[split] = policies.make_agent_loop(world)
         explore = jax.jit(explore_homes, static_argnums=(0, 6, 7))
-        snapshots[split], look_counts = explore(
-            agent_loop,
+        snapshots[split], look_counts[split] = explore(
+            agent_loops[split],
             init_params(policies.spec, key),
             locate_objects(world.banks[0]),
             world.make_env_params(0),
@@ -117,8 +119,8 @@ def main(run_dir: str, predictor_names: Sequence[str], penalty: float, num_searc
             num_searches,
             num_steps,
         )
-        if split == "train":
-            rates = detection_rates(look_counts)
+    agent_loop = agent_loops["train"]
+    rates = detection_rates(look_counts["train"])
 
     # The layout's weights before the first view, as in a fit.
     goals = np.flatnonzero(agent_loop.env.task.is_goal())
