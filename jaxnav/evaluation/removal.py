@@ -11,6 +11,7 @@ traced array, so one compilation serves all entries.
 """
 
 import enum
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -19,6 +20,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxnav.causal import FORMS, do, removal_weight, remove_from_sum, stde, tde
+from jaxnav.choices import Form
 from jaxnav.evaluation.replacements import other_running_episode
 from jaxnav.policies.handover import Decider
 from jaxnav.policies.pathways import Pathways, PolicyState
@@ -231,16 +233,17 @@ def apply_removal(
     Returns:
       Logits float32 [E, A], and the weight float32 [E] of the removed ones.
     """
-    # The form is a traced index: compute every form, then pick one.
-    logits_by_form = []
-    for form in FORMS:
+
+    # The form is a traced index. Entries run one by one, so `switch` computes the selected form alone.
+    def remove_softly(form: Form) -> tuple[jax.Array, jax.Array]:
+        weight = removal_weight(gap, config.epsilon, form)
         if has_additive_scores and form != "residual":
             direct = tde(logits, removed_logits)
-            logits_by_form.append(remove_from_sum(direct, removed_logits, gap, config.epsilon, form))
-        else:
-            logits_by_form.append(stde(logits, removed_logits, gap, config.epsilon, form))
-    soft_logits = jnp.stack(logits_by_form)[config.form]
-    soft_weight = jnp.stack([removal_weight(gap, config.epsilon, form) for form in FORMS])[config.form]
+            return remove_from_sum(direct, removed_logits, gap, config.epsilon, form), weight
+        return stde(logits, removed_logits, gap, config.epsilon, form), weight
+
+    branches = [functools.partial(remove_softly, form) for form in FORMS]
+    soft_logits, soft_weight = jax.lax.switch(config.form, branches)
 
     corrected_logits = jnp.where(config.remove_completely, tde(logits, removed_logits), soft_logits)
     weight = jnp.where(config.remove_completely, 1.0, soft_weight)
