@@ -1,4 +1,6 @@
-"""Run the layout estimator on your own detections: three views of a kitchen, then one that does not fit.
+"""Run the layout estimator on your own detections: two views of a kitchen, then two with things of a bedroom.
+
+The layout gap rises in the last two views, because their pairs are new.
 
 python examples/own_detections.py
 """

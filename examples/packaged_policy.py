@@ -1,6 +1,6 @@
 """Sweep the threshold of sTDE over a trained policy in unseen rooms, with the layout as trained and shifted.
 
-The packaged policy is a pytree, so the sweep is a plain `jax.vmap`.
+The packaged policy is a pytree, so the sweep is a plain `jax.vmap`. Success counts within 100 actions.
 
 python examples/packaged_policy.py
 """

@@ -10,7 +10,7 @@ from jaxnav import __version__
 
 COMMANDS = {
     "train": "train policies of a method, without and with layout weights",
-    "eval": "evaluate a run, or print a finished evaluation again",
+    "eval": "evaluate a run, a policy or an agent of yours",
     "sweep": "evaluate many thresholds of sTDE: a table and a figure",
     "study": "run an experiment of the paper, or measure the value of experience",
     "report": "show a run on one HTML page: tables, curves and replays",
@@ -19,7 +19,7 @@ COMMANDS = {
     "scenes": "import scenes, draw one, or print statistics of scenes",
     "export": "export a policy: parameters, or a program that runs without jaxnav",
     "log": "show a training log in TensorBoard or Weights & Biases",
-    "list": "list worlds, methods, policies, experiments and configurations",
+    "list": "list worlds, methods, policies, experiments, benchmarks, settings",
     "completion": "print a script that completes commands and options in your shell",
     "help": "print this help, or the help of a command",
 }

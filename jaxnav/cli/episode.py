@@ -38,8 +38,9 @@ class EpisodeConfig:
         successes are printed.
       shift_by: categories that exchange their places under a shift. `size`: neighbours in size, drawn for each scene.
         `context`: the ones whose exchange misleads most, fitted to the training scenes and equal in all scenes.
-      map: draw the map that the agent made, the block that it searches and its way to it, with a row for each
-        `--shift`. This needs a method that searches with a map, and writes a PNG.
+      map: draw the agent's map, its target and its planned path, with a row for each `--shift`; for the method `belief`
+        also the probability of the goal, before and after the removal of experience. This needs a method that searches
+        with a map (`semexp`, `belief`), and writes a PNG.
       step: step at which the map is drawn, from 1. Shorter episodes show their end. The default is the last step.
     """
 

@@ -37,7 +37,7 @@ class EvalConfig:
     Attributes:
       subject: a run directory, the folder of an exported policy, the name of a packaged policy, such as `rooms-org`, or
         an agent of your own as `package.module:AGENT`, which is shown beside Random, frontier search and the shortest
-        path; or the JSON file of a finished evaluation to print.
+        path; or the JSON file of a finished evaluation (not of a benchmark) to print.
       split: scenes to evaluate on.
       scenes: scene file to use instead of the scenes of the run or of the generated world.
       world: generated world to use. The default is `rooms` for an agent, and the world of a run or a policy, whose
@@ -53,16 +53,18 @@ class EvalConfig:
         counterfactual logits (see `removal`); the share is the excess of the layout gap over the threshold. `residual`
         does this without changing the scale of the logits. `switch` subtracts these logits completely where the gap
         exceeds the threshold. `mixture` mixes the probabilities of the decisions with and without experience, with the
-        same share. The default is the rule of the layout estimator, and `paper` with `--removal cde`.
-      removal: decisions that are left when experience is removed. `tde`, the total direct effect (equation 1):
+        same share. The default is `residual` (`paper` for the method `belief` and with `--removal cde`), unless the
+        layout estimator of the run sets another.
+      removal: decisions that remain when experience is removed. `tde`, the total direct effect (equation 1):
         subtracts the counterfactual logits, in which scene and goal are zero and experience is not. `cde`, the
-        controlled direct effect: leads over to the decision of the same network without experience throughout the
+        controlled direct effect: leads to the decision of the same network without experience throughout the
         episode, for runs with `--ppo.experience` below 1. Each adds a row for complete removal and one for each
         threshold and rule.
       counterfactual_memory: memory from which the counterfactual logits are computed: the `factual` one, or one of
         their `own`, for runs with this option. The default is the one of the run.
       setting: layout estimator or layout gap to use instead of that of the run, for example `learned`, a gap that
-        detects another layout; `jaxnav list settings` describes all.
+        detects another layout; `jaxnav list settings` describes all. The default of runs is the estimator
+        `calibrated` with the gap of equation 5.
       hold: keep the layout gap from falling within an episode. With `--form switch`, experience then stays removed for
         the rest of the episode once the gap exceeds the threshold.
       inner_steps: largest number of adaptation steps in an episode, at least 0, for methods that learn while they act

@@ -55,7 +55,7 @@ class SweepConfig:
         with scene and goal set to zero; the share is the excess of the layout gap over the threshold. `residual` does
         this without changing the scale of the logits. `switch` subtracts these logits completely where the gap exceeds
         the threshold. `mixture` mixes the probabilities of the decisions with and without experience, with the same
-        share. The default is the rule of the layout estimator.
+        share. The default is `residual` (`paper` for the method `belief`), unless the layout estimator sets another.
       setting: layout estimator or layout gap to use instead of that of the run or policy, for example `learned`, a gap
         that detects another layout; `jaxnav list settings` describes all.
       hold: keep the gap from falling within an episode. With `--form switch`, experience then stays removed for the

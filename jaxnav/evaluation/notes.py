@@ -78,10 +78,18 @@ def decision_share_notes(decision_shares: Sequence[Mapping[str, Any]]) -> list[s
             cost = Interval.from_json(entry["cost"]["spl"])
             has_no_cost = cost.low <= 0.0 <= cost.high
             cost_text = f" and replacing them costs {cost:.1f} SPL"
-        if share < MIN_OTHER_CATEGORIES_SHARE or has_no_cost:
+
+        # Few decisions cannot show an effect of w or sTDE; many may do so in more episodes.
+        is_idle = share < MIN_OTHER_CATEGORIES_SHARE
+        if is_idle or has_no_cost:
+            conclusion = (
+                "so this row tests neither w nor sTDE"
+                if is_idle
+                else "an interval that contains 0: only more episodes can tell whether w or sTDE matter in this row"
+            )
             share_notes.append(
                 f"{entry['variant']} ({entry['decoding']}): {share:.1f} % of the decisions depend on other categories "
-                f"within Z{cost_text}, so this row tests neither w nor sTDE."
+                f"within Z{cost_text}, {conclusion}."
             )
     return share_notes
 

@@ -20,7 +20,7 @@ class ReportConfig:
       shift_by: categories that exchange their places under a shift. `size`: neighbours in size, drawn for each scene.
         `context`: the ones whose exchange misleads most, fitted to the training scenes and equal in all scenes.
       episodes: number of fixed episodes at each layout shift, at least 1.
-      epsilon: thresholds of sTDE in the curves, each at least 0.
+      epsilon: thresholds of sTDE in the curves, each at least 0; `threshold` is that of the tables.
       threshold: threshold of sTDE in the tables and replays, at least 0.
       replays: number of episodes that can be replayed, at least one for each layout shift. Episodes in which the agents
         differ come first.

@@ -184,7 +184,7 @@ def _results_section(reports: Mapping[float, _Report], threshold: float) -> Sect
     short_reports: dict[float, _Report] = {}
     text_tables = []
     folded_tables = []
-    all_notes = []
+    shifts_by_note: dict[str, list[str]] = {}
     for shift, report in reports.items():
         short_report = _at_threshold(report, threshold)
         short_reports[shift] = short_report
@@ -194,16 +194,20 @@ def _results_section(reports: Mapping[float, _Report], threshold: float) -> Sect
             folded_tables.append(to_text_table(f"{shift_title}, paired differences", difference_table(short_report)))
         if len(short_report["rows"]) < len(report["rows"]):
             folded_tables.append(to_text_table(f"{shift_title}, every threshold", results_table(report)))
-        all_notes += report["notes"]
+        for note in report["notes"]:
+            shifts_by_note.setdefault(note, []).append(shift_title)
 
     # The chart compares shifts, so that all of them need paired differences.
     section_charts = ()
     if all(report["differences"] for report in reports.values()):
         section_charts = (differences_chart(short_reports),)
 
-    # Evaluations of one run repeat most of their notes.
-    unique_notes = tuple(dict.fromkeys(all_notes))
-    return Section("Results", _RESULTS_TEXT, section_charts, tuple(text_tables), tuple(folded_tables), unique_notes)
+    # Evaluations of one run repeat most of their notes; the title of a note names the shifts if it is not that of all.
+    notes = []
+    for note, shift_titles in shifts_by_note.items():
+        is_common = len(shift_titles) == len(reports)
+        notes.append(note if is_common else f"{', '.join(shift_titles)}: {note}")
+    return Section("Results", _RESULTS_TEXT, section_charts, tuple(text_tables), tuple(folded_tables), tuple(notes))
 
 
 def _at_threshold(report: _Report, threshold: float) -> _Report:

@@ -59,7 +59,7 @@ def test_readme_has_a_command_of_each_kind():
 def test_commands_of_the_readme_run_twice(tmp_path):
     write_config(tmp_path)
     (tmp_path / "my_module.py").write_text(AGENT_MODULE)
-    (tmp_path / "train.jsonl.gz").write_text(json.dumps(HOUSE))
+    (tmp_path / "train.jsonl.gz").write_text("\n".join([json.dumps(HOUSE)] * 10))
 
     first_files = run_readme(tmp_path)
     second_files = run_readme(tmp_path)
