@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     from jaxnav.scenes.files.importing import ImportSummary
 
 
+#: An import prints this many refused scenes, and counts the rest.
+MAX_PRINTED_REFUSALS = 10
+
+
 @dataclasses.dataclass(frozen=True)
 class ImportConfig:
     """Options of the scenes import command.
@@ -123,8 +127,15 @@ def _import(config: ImportConfig, console: Console) -> None:
     from jaxnav.scenes.categories import format_most_common
     from jaxnav.scenes.files.importing import filter_scenes, import_scenes, read_source
 
+    refusals: list[InputError] = []
+
     def report_refusal(error: InputError) -> None:
-        console.print(f"refused: {error}", style="yellow")
+        """Print the first refusals; a file of another format may have thousands."""
+        refusals.append(error)
+        if len(refusals) <= MAX_PRINTED_REFUSALS:
+            console.print(f"refused: {error}", style="yellow")
+        elif len(refusals) == MAX_PRINTED_REFUSALS + 1:
+            console.print("refused: further scenes, which are only counted", style="yellow")
 
     # Read and select the scenes, and write them by split.
     scenes = read_source(

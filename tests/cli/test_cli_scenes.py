@@ -109,6 +109,17 @@ def test_import_counts_refused_scenes_and_keeps_the_rest(tmp_path, capsys):
     assert "objects: 4 read, 2 kept, 2 skipped (2 in refused scenes)" in output
 
 
+def test_import_prints_the_first_ten_refusals(tmp_path, capsys):
+    house_without_wall = HOUSE | {"doors": [door("wall|9|0.00|0.00|1.00|0.00", 1.0, 2.0)]}
+    source = write_lines(tmp_path / "houses.jsonl", HOUSE, *[house_without_wall] * 12)
+    assert import_scenes("procthor", source, tmp_path / "scenes.jsonl.gz") == 0
+
+    output = capsys.readouterr().err
+    assert output.count(f"refused: {source}") == 10
+    assert output.count("refused: further scenes") == 1
+    assert "1 scenes imported, 12 refused" in output
+
+
 def test_import_counts_unconnected_cells(tmp_path, capsys):
     house_without_doors = HOUSE | {"doors": []}
     source = write_lines(tmp_path / "houses.jsonl", HOUSE, house_without_doors)
