@@ -199,9 +199,13 @@ def check_experiment(config: ExperimentConfig) -> ExperimentConfig:
     runs = agent_runs(config)
     if not any(matches_any(f"{run.world}-{run.agent}", config.only) for run in runs):
         raise InputError("worlds, agents, only and left_out: select no run; give others")
-    for measurement in config.measure:
-        if not measured_runs(dataclasses.replace(config, only=("*",)), measurement):
-            raise InputError(f"measure.{measurement}: {config.measure[measurement]} match no agent; give others")
+    for measurement, patterns in config.measure.items():
+        if not patterns:
+            raise InputError(f"measure.{measurement}: {patterns} match no agent; give others")
+        for pattern in patterns:
+            one_pattern = dataclasses.replace(config, only=("*",), measure={measurement: [pattern]})
+            if not measured_runs(one_pattern, measurement):
+                raise InputError(f"measure.{measurement}: {pattern!r} matches no agent; give another")
     _check_seeds(runs)
     for run in runs:
         if not isinstance(run.config.devices, int | None):

@@ -187,6 +187,7 @@ def test_finished_runs_of_agents_keep_their_settings_and_references(drawn_run):
         ({"agents": {"plain": {"against": ["wide"]}, "wide": {"seeds": 5}}}, "near-plain.*seeds"),
         # Measurements and groups.
         ({"measure": {"evaluation": ["plane"]}}, "measure.evaluation"),
+        ({"measure": {"evaluation": ["plain", "plane"]}}, "measure.evaluation: 'plane'"),
         ({"groups": {"plain": {"agents": ["wide"], "variant": "stde", "against": "layout"}}}, "groups.plain"),
         ({"measure": {"evaluation": "plain"}}, "measure.evaluation"),
         ({"measure": {"evaluation": [1]}}, "measure.evaluation"),
