@@ -24,7 +24,7 @@ def test_every_registry_is_listed_with_a_description(entries_by_kind):
     names_by_kind = {kind: [entry["name"] for entry in entries] for kind, entries in entries_by_kind.items()}
     assert names_by_kind["worlds"] == list(WORLDS)
     assert names_by_kind["methods"] == sorted(METHODS)
-    assert names_by_kind["policies"] == ["houses-belief", "houses-org", "rooms-org"]
+    assert names_by_kind["policies"] == ["apartments-belief", "houses-belief", "houses-org", "rooms-org"]
     assert {"study", "table2", "mixture"} <= set(names_by_kind["experiments"])
     assert names_by_kind["configurations"] == list(CONFIGS)
     assert set(ESTIMATORS) - {"calibrated"} <= set(names_by_kind["settings"])  # `calibrated` is the default
