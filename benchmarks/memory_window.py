@@ -10,6 +10,7 @@ goes to stdout as JSON.
 """
 
 import argparse
+import dataclasses
 import sys
 from collections.abc import Sequence
 
@@ -40,11 +41,11 @@ def main(run_dirs: Sequence[str], split: str, num_episodes: int, min_cells: int)
         world = compile_evaluation_world(run.config, split, None, None, PlainConsole(stderr=True))
         home_sizes = {scene.name: longest_side(scene) for scene in world.scenes}
         row = table_row("layout", None, None, "argmax")
-        for memory_name, forget_cells in (("window", SpatialMemory._forget_left_cells), ("torus", keep_all_cells)):
-            # The function is read while the program is traced, so each memory needs a trace of its own.
-            SpatialMemory._forget_left_cells = forget_cells  # type: ignore[method-assign]
-            jax.clear_caches()
-            episode_lists, outcome, _ = evaluate_rows([row], policies, world, num_episodes, 0)
+        assert policies.spec.spatial_memory is not None
+        torus = TorusMemory(**dataclasses.asdict(policies.spec.spatial_memory))
+        torus_policies = policies._replace(spec=dataclasses.replace(policies.spec, spatial_memory=torus))
+        for memory_name, memory_policies in (("window", policies), ("torus", torus_policies)):
+            episode_lists, outcome, _ = evaluate_rows([row], memory_policies, world, num_episodes, 0)
             [episodes] = episode_lists
             metrics = episode_metrics(outcome, episodes.best_length, ())
 
@@ -59,9 +60,12 @@ def main(run_dirs: Sequence[str], split: str, num_episodes: int, min_cells: int)
     print_report({"split": split, "min_cells": min_cells, "episodes": len(plans)} | summarize(values, plans))
 
 
-def keep_all_cells(memory: SpatialMemory, cells: jax.Array, position: jax.Array, step: jax.Array) -> jax.Array:
-    """Forget nothing: the memory before version 0.4."""
-    return cells
+class TorusMemory(SpatialMemory):
+    """Spatial memory that forgets nothing, as before version 0.4."""
+
+    def _forget_left_cells(self, cells: jax.Array, position: jax.Array, step: jax.Array) -> jax.Array:
+        """Keep all cells."""
+        return cells
 
 
 def longest_side(scene: Scene) -> float:

@@ -203,8 +203,7 @@ def check_experiment(config: ExperimentConfig) -> ExperimentConfig:
         if not patterns:
             raise InputError(f"measure.{measurement}: {patterns} match no agent; give others")
         for pattern in patterns:
-            one_pattern = dataclasses.replace(config, only=("*",), measure={measurement: [pattern]})
-            if not measured_runs(one_pattern, measurement):
+            if not any(_is_measured(run, (pattern,)) for run in runs):
                 raise InputError(f"measure.{measurement}: {pattern!r} matches no agent; give another")
     _check_seeds(runs)
     for run in runs:
@@ -358,11 +357,14 @@ def measured_runs(config: ExperimentConfig, measurement: str) -> list[AgentRun]:
     patterns = tuple(config.measure[measurement])
     runs = []
     for run in agent_runs(config):
-        full_name = f"{run.world}-{run.agent}"
-        is_measured = matches_any(run.agent, patterns) or matches_any(full_name, patterns)
-        if is_measured and matches_any(full_name, config.only):
+        if _is_measured(run, patterns) and matches_any(f"{run.world}-{run.agent}", config.only):
             runs.append(run)
     return runs
+
+
+def _is_measured(run: AgentRun, patterns: tuple[str, ...]) -> bool:
+    """True if the agent of a run, or its world and agent, match one of the patterns of a measurement."""
+    return matches_any(run.agent, patterns) or matches_any(f"{run.world}-{run.agent}", patterns)
 
 
 def join_folds(config: ExperimentConfig, runs: list[AgentRun]) -> list[AgentRun]:
