@@ -135,6 +135,17 @@ def test_mean_variance_is_at_least_that_of_scenes_or_runs():
 # Differences
 
 
+def test_paired_difference_of_fixed_policies_averages_their_runs():
+    # The runs gain 1 to 5 and 101 to 105 in five scenes, 51 to 55 on average. As in the first test above, the variance
+    # over scenes is 2.5 / 5; how far the two runs are apart does not matter for these very policies.
+    gains = np.array([[1.0, 2, 3, 4, 5], [101.0, 102, 103, 104, 105]])
+    reference = np.full((2, 5), 7.0)
+    interval = paired_difference(reference, reference + gains, scenes_of(5), trained=False)
+    assert interval.mean == pytest.approx(53)
+    assert half_width(interval) == pytest.approx(t.ppf(0.975, 4) * math.sqrt(0.5))
+    assert half_width(paired_difference(reference, reference + gains, scenes_of(5))) > 100
+
+
 def test_paired_difference_cancels_scene_effects():
     # Scenes differ by up to 10; the second variant gains exactly 1 in each.
     values = np.array([[0.0, 3, 10, 4], [1, 2, 9, 5]])

@@ -1,5 +1,7 @@
 """A run directory may have any name: checkpoints are stored under it alone, or it is refused before anything is done.
 
+`python -m support.path_names` in `tests` trains in every one of these directories and prints a table.
+
 Seen to fail: with the folder itself given to Orbax instead of a link, 14 of the names below cannot be read or saved; a
 `~` that is not expanded is a folder of this name.
 """
@@ -12,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 from support.commands import evaluate, refusal, train
+from support.path_names import NAMES
 from support.refusals import assert_message_names
 from support.tiers import params_by_tier
 from support.tiny_run import write_config
@@ -27,16 +30,6 @@ from jaxnav.store.files import expand_home, make_manifest, write_atomic
 
 MANIFEST = make_manifest({})
 STATE = {"weights": jnp.arange(3.0)}
-
-#: Names that a shell, a pattern, an address, an escape, a parser or a decoder may take for something else.
-NAMES = (
-    *("plain", "exp[1]", "[x]", "[!a]", "[]", "[", "]", "a]b[", "{a,b}", "{x}", "{"),
-    *("*", "a*", "**", "?", "a?b", "\\", "a\\b", "q\\", "\\\\n", "^", "|", "a|b"),
-    *("%", "%20", "%2F", "%s", "#", "a#b", "&", "a&b=c", "!", ";", "@", "+", "=", "<a>"),
-    *(":", "a:b", "C:", "gs:", "s3:", "file:", "'", '"', "`", "$HOME", "${x}", "$(x)"),
-    *("-x", "--x", "-", " ", " a ", "a b", "\t", "a\nb", "\x01", "\x7f", "~", "~x", "..."),
-    *("é", "日本", "\u202e", "😀", os.fsdecode(b"\xff"), os.fsdecode(b"a\xe9b"), "n" * 255, "é" * 127),
-)
 
 
 @pytest.mark.parametrize("name", params_by_tier(NAMES, fast=NAMES[::6], slow=NAMES), ids=ascii)

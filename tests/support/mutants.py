@@ -22,6 +22,7 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).parents[2]
 LEAST = 0.9
+FAST_TIER = "not slow and not exhaustive"
 SECONDS = 900  # after which a mutant counts as killed: it does not end
 #: The modules, and the files of `tests` that have to kill their mutants.
 TESTS = {
@@ -32,7 +33,10 @@ TESTS = {
     "numerics/recurrence.py": "numerics/test_recurrence.py",
     "numerics/rounding.py": "numerics/test_rounding.py",
     "numerics/sparse.py": "numerics/test_sparse.py",
-    "training/ppo.py": "training/test_loss.py training/test_collect.py",
+    "training/ppo.py": (
+        "training/test_loss.py training/test_collect.py training/test_guidance.py "
+        "training/test_counterfactual_memory.py"
+    ),
     "evaluation/grid.py": "evaluation/test_episodes.py",
     "evaluation/statistics.py": (
         "evaluation/test_statistics.py evaluation/test_interval.py "
@@ -147,15 +151,15 @@ def project() -> Iterator[Path]:
         yield folder
 
 
-def passes(folder: Path, tests: str) -> bool:
-    """Check whether tests, separated by spaces, pass in a copy of the project."""
+def passes(folder: Path, tests: str, tier: str = FAST_TIER) -> bool:
+    """Check whether the tests of a tier in files, separated by spaces, pass in a copy of the project."""
     environment = os.environ | {
         "PYTHONPATH": str(folder),
         "PYTEST_XDIST_WORKER": "mutants",  # what is compiled is kept here, from one mutant to the next
         "JAX_COMPILATION_CACHE_DIR": str(folder / "compiled"),
         "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
     }
-    options = ["-x", "-n", "0", "-p", "no:cacheprovider", "--timeout", "0"]
+    options = ["-x", "-n", "0", "-m", tier, "-p", "no:cacheprovider", "--timeout", "0"]
     test_files = [str(folder / "tests" / name) for name in tests.split()]
     command = [sys.executable, "-m", "pytest", *options, *test_files]
     try:
@@ -165,13 +169,13 @@ def passes(folder: Path, tests: str) -> bool:
     return process.returncode == 0
 
 
-def survives(folder: Path, module: str, source: str, tests: str) -> bool:
-    """Check whether tests overlook another source of a module."""
+def survives(folder: Path, module: str, source: str, tests: str, tier: str = FAST_TIER) -> bool:
+    """Check whether the tests of a tier overlook another source of a module."""
     path = folder / "jaxnav" / module
     original = path.read_text()
     path.write_text(source)
     try:
-        return passes(folder, tests)
+        return passes(folder, tests, tier)
     finally:
         path.write_text(original)
 

@@ -7,7 +7,7 @@ tests of one pass all the same.
 import sys
 from typing import NamedTuple
 
-from support.mutants import ROOT, passes, project, survives
+from support.mutants import FAST_TIER, ROOT, passes, project, survives
 
 
 class Mistake(NamedTuple):
@@ -18,12 +18,14 @@ class Mistake(NamedTuple):
       before: a text of the module.
       after: the text in its place.
       tests: path in `tests` of the tests that have to fail.
+      tier: the tests of this file, as an expression of markers.
     """
 
     module: str
     before: str
     after: str
     tests: str
+    tier: str = FAST_TIER
 
 
 INFERENCE = "twins/test_inference.py"
@@ -47,9 +49,10 @@ MISTAKES = (
     Mistake("policies/methods/tpn.py", "(keys @ state[..., None])[..., 0]",
             "(keys @ state[..., None])[..., 0] / np.sqrt(state.shape[-1])", TENTATIVE),
     Mistake("policies/spatial_memory.py", "stride: int = 2", "stride: int = 1", INFERENCE),
-    Mistake("training/ppo.py", "policy_loss = -masked_mean(", "policy_loss = masked_mean(", PROBES),
-    Mistake("training/ppo.py", "reward + gamma * next_value - value", "reward + next_value - value", PROBES),
-    Mistake("training/ppo.py", "scalars.value_weight * value_loss", "0.0 * value_loss", PROBES),
+    Mistake("training/ppo.py", "policy_loss = -masked_mean(", "policy_loss = masked_mean(", PROBES, "slow"),
+    Mistake("training/ppo.py", "reward + gamma * next_value - value", "reward + next_value - value", PROBES,
+            "slow"),
+    Mistake("training/ppo.py", "scalars.value_weight * value_loss", "0.0 * value_loss", PROBES, "slow"),
     Mistake("causal.py", "jnp.where(s == 0, logits, effect)", "effect", "test_causal.py"),
     Mistake("causal.py", "gap - epsilon)", "gap - float(epsilon))", "test_causal.py"),
     Mistake("evaluation/grid.py", "success * best_length / length", "success * length / best_length",
@@ -77,14 +80,15 @@ def main() -> bool:
     """Plant every mistake, print what becomes of it, and return whether all were noticed."""
     noticed = True
     with project() as folder:
-        for tests in dict.fromkeys(mistake.tests for mistake in MISTAKES):
-            if not passes(folder, tests):
+        for tests, tier in dict.fromkeys((mistake.tests, mistake.tier) for mistake in MISTAKES):
+            if not passes(folder, tests, tier):
                 raise SystemExit(f"{tests} fails without a mistake; fix it first")
         for mistake in MISTAKES:
             source = (ROOT / "jaxnav" / mistake.module).read_text()
             if mistake.before not in source:
                 raise SystemExit(f"{mistake.module} holds no {mistake.before!r}; bring the list up to date")
-            alive = survives(folder, mistake.module, source.replace(mistake.before, mistake.after, 1), mistake.tests)
+            mutant_source = source.replace(mistake.before, mistake.after, 1)
+            alive = survives(folder, mistake.module, mutant_source, mistake.tests, mistake.tier)
             noticed &= not alive
             print(
                 "OVERLOOKED" if alive else "noticed   ", mistake.module, repr(mistake.after), mistake.tests, flush=True
