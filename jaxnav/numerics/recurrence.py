@@ -81,8 +81,10 @@ def _unroll_forward(
         next_hidden = jnp.where(ended[:, None], 0.0, hidden_after)
         return next_hidden, (UnrolledGRU(hidden_after, hidden_before, hidden_gates), step_vjp)
 
-    # Scan over time; the leaves of `step_vjps` are those of the single steps, stacked to [T, ...].
-    _, (unrolled, step_vjps) = jax.lax.scan(step, hidden, (input_gates, ended))
+    # Scan over time; the leaves of `step_vjps` are those of the single steps, stacked to [T, ...]. With JAX_DISABLE_JIT
+    # a scan is a Python loop, which cannot stack the gradient functions of its steps.
+    with jax.disable_jit(False):
+        _, (unrolled, step_vjps) = jax.lax.scan(step, hidden, (input_gates, ended))
     return unrolled, (kernel, unrolled.hidden_before, ended, step_vjps)
 
 

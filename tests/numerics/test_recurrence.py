@@ -83,3 +83,12 @@ def test_unroll_gru_has_the_gradients_of_the_loop_with_a_second_decision(rollout
 
     first_gradient = jax.grad(loss_of_first_decision)(kernel)
     assert np.abs(np.asarray(gradients[0] - first_gradient)).max() > 0.1
+
+
+def test_gradients_of_unroll_gru_without_compilation(rollout):
+    def loss(kernel):
+        return jnp.sin(unroll_gru(kernel, *rollout[1:]).hidden_after).sum()
+
+    expected_gradient = jax.grad(loss)(rollout[0])
+    with jax.disable_jit():
+        np.testing.assert_allclose(jax.grad(loss)(rollout[0]), expected_gradient, rtol=1e-5, atol=1e-6)
