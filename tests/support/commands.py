@@ -8,7 +8,7 @@ from jaxnav.cli import eval as eval_command
 from jaxnav.cli import train as train_command
 
 
-def train(config_file: Path | str, run_dir: Path, *options: object) -> int:
+def train(config_file: Path | str, run_dir: Path | str, *options: object) -> int:
     """Run the train command, and return its exit code."""
     return train_command.main(["--config", str(config_file), "--run-dir", str(run_dir), *map(str, options)])
 

@@ -34,19 +34,22 @@ def try_name(name: str, run_dir: str) -> tuple[list[int], list[str]]:
 
     Args:
       name: name of the working directory.
-      run_dir: the run directory, as on the command line.
+      run_dir: the run directory, as on the command line. A leading `~` is taken for the home folder, also after `./`,
+        so a folder of this name is given by its whole path.
     """
     exit_codes = []
     with tempfile.TemporaryDirectory() as folder:
         config_file = write_config(Path(folder))
         working_dir = Path(folder) / name
         working_dir.mkdir()
+        if name.startswith("~"):
+            run_dir = str(working_dir / name)
         with contextlib.chdir(working_dir), contextlib.redirect_stdout(io.StringIO()):
             for _ in range(2):
-                exit_codes.append(train(config_file, Path(run_dir), "--seeds", 1, "--arms", "baseline"))
+                exit_codes.append(train(config_file, run_dir, "--seeds", 1, "--arms", "baseline"))
 
         # The run holds its log; everything else of the folder was written outside of the run.
-        expected_dir = os.path.normpath(os.path.join(name, run_dir))
+        expected_dir = os.path.relpath(os.path.join(working_dir, run_dir), folder)
         strays = []
         for path in contents(Path(folder)):
             if path != config_file.name and not path.startswith(f"{expected_dir}{os.sep}"):
@@ -68,14 +71,15 @@ def print_table() -> int:
 
         # Possible names are trained and found again, impossible ones are refused in one line.
         if run_dir in IMPOSSIBLE_NAMES:
-            fault = exit_codes != [2, 2] or len(lines) != 2
+            num_errors = sum(line.startswith("error: ") for line in lines)
+            fault = exit_codes != [2, 2] or num_errors != 2
             outcome = lines[-1][-60:]
         else:
             fault = exit_codes != [0, 0] or not is_resumed
             outcome = "trained, resumed"
         fault = fault or bool(strays)
         num_faults += fault
-        label = ascii(run_dir) if len(run_dir) < 40 else f"{run_dir[0]!a} x {len(run_dir)}"
+        label = ascii(run_dir) if len(run_dir) < 40 else f"{run_dir[-1]!a} x {len(run_dir.removeprefix('./'))}"
         print(f"{label:24}", exit_codes, strays, f"FAULT: {lines}" if fault else outcome, sep="  ", flush=True)
     print(f"{num_faults} faults in {len(attempts)} paths")
     return num_faults
