@@ -46,7 +46,7 @@ Tree = TypeVar("Tree")
 #: Metres that DTS subtracts from the distance to the goal.
 GOAL_RADIUS = 1.0
 #: Batch sizes, as divisors of E: once at most E / divisor episodes still run, the batch shrinks to that size.
-_BATCH_DIVISORS = (2, 4, 16)
+_BATCH_DIVISORS = (3, 12)
 
 
 class EpisodeOutcome(NamedTuple):
