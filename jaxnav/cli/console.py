@@ -66,7 +66,9 @@ _MIN_WIDTH = 40
 _MAX_HELP_WIDTH = 100
 #: Width of output that goes to a file or a pipe, in columns, where nothing should be wrapped.
 _PIPE_WIDTH = 10_000
-#: Seconds from which a compilation is cached, and its freed memory returned.
+#: Seconds from which a compiled program is kept for the next command.
+_CACHED_COMPILATION_S = 0.2
+#: Seconds from which the memory that a compilation freed is returned.
 _LONG_COMPILATION_S = 0.5
 #: Longest name of a results file without its endings, and longest part of it, in characters.
 _MAX_NAME_LENGTH = 160
@@ -745,7 +747,7 @@ def _enable_program_cache(console: Console) -> None:
         console.print(f"warning: compiled programs are not kept: {error}", style="yellow")
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", _LONG_COMPILATION_S)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", _CACHED_COMPILATION_S)
 
 
 @functools.cache

@@ -10,6 +10,7 @@ from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxnav.causal import FORMS
 from jaxnav.choices import Form, Removal, RowDecoding, Variant
@@ -124,7 +125,7 @@ def inference_grid(rows: Sequence[EvaluationRow], arms: Sequence[str], num_seeds
     for row in rows:
         for seed in range(num_seeds):
             entries.append(_grid_entry(row, arms, seed, num_seeds))
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *entries)
+    return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *entries)
 
 
 class Replacement(NamedTuple):

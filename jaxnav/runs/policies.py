@@ -401,7 +401,8 @@ def load_policies(config: RunConfig, arms: Sequence[str] | None = None) -> Polic
         )
 
     # Leaves [A S, ...], arm by arm.
-    params = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(policies.params for policies in parsed_policies))
+    params_by_policy = [policies.params for policies in parsed_policies]
+    params = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *params_by_policy)
     return parsed_policies[reference_index]._replace(params=params, arms=arms)
 
 

@@ -571,7 +571,7 @@ def make_trainer(
         scalars_by_policy += [point_scalars] * point.seeds
     stage_scalars = []
     for policy_scalars in zip(*scalars_by_policy, strict=True):
-        stage_scalars.append(jax.tree.map(lambda *leaves: jnp.stack(leaves), *policy_scalars))
+        stage_scalars.append(jax.tree.map(lambda *leaves: np.stack(leaves), *policy_scalars))
 
     # With a mesh, seeds and environments are sharded over its devices.
     trainer_class = Trainer if mesh is None else functools.partial(ShardedTrainer, mesh=mesh)
@@ -594,7 +594,9 @@ def _restore_or_init(
     Checkpoints and log rows after the restored update are moved away or dropped, because training will write them
     again.
     """
-    checkpoint = restore_checkpoint(config.run_dir, trainer.abstract_states(env_params), manifest)
+    checkpoint = None
+    if has_checkpoints(config.run_dir):
+        checkpoint = restore_checkpoint(config.run_dir, trainer.abstract_states(env_params), manifest)
     update = 0
     if checkpoint is not None:
         update = checkpoint.step

@@ -174,6 +174,7 @@ def _walk(
 # 2. Layout priors, and calibration of the estimator
 
 
+@partial(jax.jit, static_argnames="estimator_config")
 def layout_priors(counts: jax.Array, estimator_config: str | EstimatorConfig) -> jax.Array:
     """Layout priors of all room types.
 
@@ -238,11 +239,13 @@ def calibrate(
     Raises:
       InputError: no walk shows two categories together.
     """
+
     # The strength enters by the priors alone, so all strengths are measured in one call, [strengths, rooms, K, K].
-    strength_priors = []
-    for strength in strengths:
-        strength_priors.append(layout_priors(counts, dataclasses.replace(estimator_config, strength=strength)))
-    priors = jnp.stack(strength_priors)
+    def make_priors(counts: jax.Array) -> jax.Array:
+        strength_configs = [dataclasses.replace(estimator_config, strength=strength) for strength in strengths]
+        return jnp.stack([layout_priors(counts, strength_config) for strength_config in strength_configs])
+
+    priors = jax.jit(make_priors)(counts)
 
     # Measure the gaps of all pairs.
     calibrations = []

@@ -34,6 +34,9 @@ SeedMetrics = dict[str, list[dict[str, float]]]
 #: Number folded into the run's key for each arm: policies without and with the layout estimator.
 ARM_KEY_PURPOSES = {"baseline": 0, "layout": 1}
 
+#: Options of XLA for programs that run a few times and compute little: they are compiled in half the time.
+_RUN_ONCE = {"xla_backend_optimization_level": 0}
+
 
 class Trainer:
     """Trainer of all arms and seeds of a run on one device.
@@ -89,7 +92,7 @@ class Trainer:
 
     def abstract_states(self, env_params: EnvParams) -> SeedStates:
         """Shapes, dtypes and shardings of all states in a checkpoint."""
-        return jax.eval_shape(self.init, env_params)
+        return jax.eval_shape(self._abstract_init, env_params)
 
     def pack(self, seed_states: SeedStates) -> TrainerStates:
         """Convert states from those in a checkpoint."""
@@ -101,8 +104,19 @@ class Trainer:
 
     def init(self, env_params: EnvParams) -> TrainerStates:
         """Start all seeds, each with a key of its own."""
+        return self._init_seeds(self._init_functions, env_params)
+
+    def _abstract_init(self, env_params: EnvParams) -> SeedStates:
+        """Start all seeds by functions that are not jitted: JAX traces no options of the compiler."""
+        init_functions = {arm: self._stage_learner(arm, 0).init for arm in self.learners}
+        return self._init_seeds(init_functions, env_params)
+
+    def _init_seeds(
+        self, init_functions: Mapping[str, Callable[..., LearnerState]], env_params: EnvParams
+    ) -> SeedStates:
+        """Start all seeds by the function of each arm."""
         seed_states: SeedStates = {}
-        for arm, init in self._init_functions.items():
+        for arm, init in init_functions.items():
             arm_key = jax.random.fold_in(self._key, ARM_KEY_PURPOSES[arm])
             seed_states[arm] = []
             for policy_index, seed in enumerate(self._seeds):
@@ -196,7 +210,7 @@ class Trainer:
     # How a learner's functions are compiled; a trainer on several devices does it differently.
 
     def _jit_init(self, learner: Learner) -> Any:
-        return jax.jit(learner.init)
+        return jax.jit(learner.init, compiler_options=_RUN_ONCE)
 
     def _jit_update(self, function: Callable[..., LearnerState], seed_axes: tuple[int | None, ...]) -> Any:
         """Jit a function of states, which it donates.
@@ -205,7 +219,7 @@ class Trainer:
           function: takes the state of one policy first.
           seed_axes: axes of `vmap` over policies, of the arguments; unused on one device.
         """
-        return jax.jit(function, donate_argnums=0)
+        return jax.jit(function, donate_argnums=0, compiler_options=_RUN_ONCE)
 
     def _compile_train(self, learner: Learner, arguments: tuple[Any, ...]) -> Any:
         def train(state: LearnerState, scalars: PPOScalars, env_params: EnvParams, knowledge: Knowledge) -> Any:
@@ -213,7 +227,9 @@ class Trainer:
 
         # Shapes say nothing of how the arrays came about, so a resumed run finds the compiled program in the cache.
         shapes = jax.eval_shape(lambda *arrays: arrays, *arguments)
-        return jax.jit(train, donate_argnums=0).lower(*shapes).compile()
+        # With JAX_DISABLE_JIT all loops would be unrolled into one enormous program.
+        with jax.disable_jit(False):
+            return jax.jit(train, donate_argnums=0).lower(*shapes).compile()
 
 
 class ShardedTrainer(Trainer):
@@ -244,7 +260,7 @@ class ShardedTrainer(Trainer):
 
     def abstract_states(self, env_params: EnvParams) -> SeedStates:
         """Shapes, dtypes and shardings of all states in a checkpoint."""
-        abstract_states = jax.eval_shape(super().init, env_params)
+        abstract_states = super().abstract_states(env_params)
 
         def add_shardings(state: LearnerState) -> LearnerState:
             shardings = jax.tree.broadcast(self._seed_sharding, state)
@@ -311,10 +327,15 @@ class ShardedTrainer(Trainer):
         return self._stage_scalars[stage_index]
 
     def _jit_init(self, learner: Learner) -> Any:
-        return jax.jit(learner.init, out_shardings=self._seed_sharding)
+        return jax.jit(learner.init, out_shardings=self._seed_sharding, compiler_options=_RUN_ONCE)
 
     def _jit_update(self, function: Callable[..., LearnerState], seed_axes: tuple[int | None, ...]) -> Any:
-        return jax.jit(jax.vmap(function, seed_axes), out_shardings=self._stacked_sharding, donate_argnums=0)
+        return jax.jit(
+            jax.vmap(function, seed_axes),
+            out_shardings=self._stacked_sharding,
+            donate_argnums=0,
+            compiler_options=_RUN_ONCE,
+        )
 
     def _compile_train(self, learner: Learner, arguments: tuple[Any, ...]) -> Any:
         replicated = replicated_sharding(self._mesh)
