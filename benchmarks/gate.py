@@ -1,33 +1,118 @@
-"""Fail if the environment has become much slower than a bare gather of its rows.
+"""Compare this checkout with an earlier commit: does anything take longer, or more memory?
 
-`python benchmarks/environment.py | python benchmarks/gate.py STORED` compares the ratios of a new report with those of
-a stored one. Both rates of a ratio are timed in turns in one process, so that the machine and its load matter little;
-`MIN_SHARE` leaves room for the rest.
+`python benchmarks/gate.py [COMMIT]` checks the commit out beside this checkout, runs the same commands in both in turns
+(A B A B ...), and prints the ratio of every measure, this checkout over the commit: median, least and greatest. The
+command ends with code 1 if the median of a ratio exceeds its limit. Without an argument, COMMIT is the one that
+`results/performance/gate_commit.txt` names.
+
+* `train` and `eval` are the commands of a smoke run, *cold* with an empty cache of compiled programs and *warm* with
+  that of the cold call: wall seconds and peak memory.
+* `update` and `environment` are the seconds per step of `training.py` (all arms and seeds) and `environment.py` (the
+  sum of rows).
 """
 
+import contextlib
 import json
+import os
+import statistics
+import subprocess
 import sys
+import tempfile
+import time
+from collections.abc import Iterator
 from pathlib import Path
 
-#: Least share of the stored ratio.
-MIN_SHARE = 0.5
+from _common import ROOT, ratio_by_turn
+
+#: Greatest ratio of a time, and of a peak of memory, which depends less on the load of the machine.
+MAX_TIME_RATIO = 1.2
+MAX_MEMORY_RATIO = 1.1
+TURNS = 3
+COMMIT_FILE = ROOT / "results" / "performance" / "gate_commit.txt"
 
 
-def main(stored_report: Path) -> bool:
-    """Print every ratio and return whether all are high enough."""
-    stored_ratios = json.loads(stored_report.read_text())["over_gather"]
-    new_ratios = json.load(sys.stdin)["over_gather"]
+def main(commit: str) -> bool:
+    """Print every ratio, and return whether all are low enough."""
+    measures: dict[str, dict[str, list[float]]] = {"here": {}, "there": {}}
+    with checked_out(commit) as base_dir:
+        for turn in range(TURNS):
+            for side, checkout in (("there", base_dir), ("here", ROOT)):
+                print(f"turn {turn + 1} of {TURNS}: {checkout}", file=sys.stderr, flush=True)
+                for name, value in measure(checkout).items():
+                    measures[side].setdefault(name, []).append(value)
 
     all_passed = True
-    for name, stored_ratio in stored_ratios.items():
-        new_median = new_ratios[name]["median"]
-        share = new_median / stored_ratio["median"]
-        passed = share >= MIN_SHARE
+    print(f"| measure | {commit} | this checkout | ratio |\n| --- | ---: | ---: | ---: |")
+    for name, values in measures["here"].items():
+        base_values = measures["there"][name]
+        ratio = ratio_by_turn(values, base_values)
+        limit = MAX_MEMORY_RATIO if name.endswith("GB") else MAX_TIME_RATIO
+        passed = ratio["median"] <= limit
         all_passed = all_passed and passed
-        verdict = "ok" if passed else "TOO SLOW"
-        print(f"{name}: {new_median:.3f} of a gather, {share:.2f} of what is stored: {verdict}")
+        ratio_text = f"{ratio['median']:.2f} ({ratio['min']:.2f} to {ratio['max']:.2f})"
+        verdict = "" if passed else f" over the limit of {limit}"
+        base_median = statistics.median(base_values)
+        new_median = statistics.median(values)
+        print(f"| {name} | {base_median:.3g} | {new_median:.3g} | {ratio_text}{verdict} |")
     return all_passed
 
 
+@contextlib.contextmanager
+def checked_out(commit: str) -> Iterator[Path]:
+    """Check a commit out in a temporary worktree."""
+    with tempfile.TemporaryDirectory() as folder:
+        worktree = Path(folder) / "base"
+        git = ["git", "-C", str(ROOT), "worktree"]
+        subprocess.run([*git, "add", "--quiet", "--detach", worktree, commit], check=True)
+        try:
+            yield worktree
+        finally:
+            subprocess.run([*git, "remove", "--force", worktree], check=True)
+
+
+def measure(checkout: Path) -> dict[str, float]:
+    """Run everything once in a checkout; values by measure, of which smaller ones are better."""
+    values = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for state in ("cold", "warm"):
+            run_dir = Path(folder) / state
+            commands = {
+                "train": ["train", "--config", "smoke", "--run-dir", str(run_dir)],
+                "eval": ["eval", str(run_dir)],
+            }
+            for name, arguments in commands.items():
+                seconds, peak_gb = run_measured(checkout, Path(folder), ["-m", "jaxnav", *arguments])
+                values[f"{name}, {state}, s"] = seconds
+                values[f"{name}, {state}, GB"] = peak_gb
+
+    training = run_benchmark(checkout, "training.py")
+    values["update, us a step"] = 1e6 / training["steps_per_s"]["all arms and seeds"]["median"]
+    environment = run_benchmark(checkout, "environment.py")
+    values["environment, ns a step"] = 1e9 / environment["steps_per_s"]["steps_sum_of_rows"]["median"]
+    return values
+
+
+def run_measured(checkout: Path, folder: Path, arguments: list[str]) -> tuple[float, float]:
+    """Run Python on the package of a checkout; wall seconds and peak memory in GB."""
+    environment = os.environ | {"PYTHONPATH": str(checkout), "JAX_COMPILATION_CACHE_DIR": str(folder / "programs")}
+    start_time = time.perf_counter()
+    process = subprocess.Popen(
+        [sys.executable, *arguments], cwd=folder, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    _, status, usage = os.wait4(process.pid, 0)
+    if status:
+        raise RuntimeError(f"{checkout}: python {' '.join(arguments)} failed")
+    return time.perf_counter() - start_time, usage.ru_maxrss / 2**20
+
+
+def run_benchmark(checkout: Path, file_name: str) -> dict:
+    """Run a benchmark of a checkout, and return its report."""
+    environment = os.environ | {"PYTHONPATH": str(checkout)}
+    command = [sys.executable, checkout / "benchmarks" / file_name]
+    output = subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout
+    return json.loads(output)
+
+
 if __name__ == "__main__":
-    sys.exit(not main(Path(sys.argv[1])))
+    arguments = sys.argv[1:] or [COMMIT_FILE.read_text().strip()]
+    sys.exit(not main(*arguments))
