@@ -711,7 +711,7 @@ def _format_int_pairs(values: dict[str, int]) -> list[str]:
 
 
 def _prepare_jax(console: Console) -> None:
-    """Set the modes of JAX that a command needs, and warn about one that makes it very slow.
+    """Set the modes of JAX that a command needs.
 
     Raises:
       InputError: an environment variable of JAX has an impossible value.
@@ -726,8 +726,10 @@ def _prepare_jax(console: Console) -> None:
         raise
 
     jax.config.update("jax_enable_x64", False)  # policies compute in float32
+    # Not compiled, a command that takes seconds takes hours.
     if jax.config.values["jax_disable_jit"]:
-        console.print("warning: JAX_DISABLE_JIT is set, so commands take many times longer; unset it", style="yellow")
+        jax.config.update("jax_disable_jit", False)
+        console.print("warning: JAX_DISABLE_JIT is ignored: commands compile; use jaxnav from Python", style="yellow")
 
 
 def _enable_program_cache(console: Console) -> None:
