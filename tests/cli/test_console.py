@@ -40,7 +40,7 @@ def test_compilation_cache_is_in_the_user_cache_folder(home, capsys):
     folder = cache_folder_of_command()
     assert folder == str(home / ".cache" / "jaxnav" / "xla")
     assert Path(folder).is_dir()
-    assert jax.config.values["jax_persistent_cache_min_compile_time_secs"] == 0.5
+    assert jax.config.values["jax_persistent_cache_min_compile_time_secs"] == 0.2
     assert capsys.readouterr().err == ""
 
 
