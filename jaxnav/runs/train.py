@@ -679,6 +679,8 @@ def run_updates(session: TrainingSession, states: TrainerStates, update: int) ->
                 states = trainer.restart(states, env_params, stage_index)
 
             # Train, and validate if due.
+            _compile_training(session, progress, states, env_params, stage_index)
+            progress.start_timing()
             states, metrics = trainer.train(states, env_params, stage_index)
             metrics = mark_undefined_means(metrics)
             update += config.chunk
@@ -712,6 +714,24 @@ def run_updates(session: TrainingSession, states: TrainerStates, update: int) ->
             stop_message = f"{config.run_dir}: stopped after update {update} of {config.total_updates} and saved"
             raise Interrupted(signal_number, stop_message)
     return states
+
+
+def _compile_training(
+    session: TrainingSession,
+    progress: "ProgressDisplay",
+    states: TrainerStates,
+    env_params: EnvParams,
+    stage_index: int,
+) -> None:
+    """Compile the updates of every arm in a stage, unless this is done, and say how long it took."""
+    arm_times = []
+    for arm in session.trainer.learners:
+        progress.show_activity(f"compiling the training of arm {arm}")
+        start = time.monotonic()
+        if session.trainer.compile(arm, states, env_params, stage_index):
+            arm_times.append(f"{arm} {time.monotonic() - start:.1f} s")
+    if arm_times:
+        session.console.print(f"compiled the training: {', '.join(arm_times)}")
 
 
 def mark_undefined_means(metrics: SeedMetrics) -> SeedMetrics:
@@ -868,12 +888,12 @@ class ProgressDisplay:
         self._config = config
         self._console = console
         self._bar = Progress(*progress_columns, console=console, disable=not console.is_terminal)
-        first_activity = f"compiling, then updates {update + 1} to {update + config.chunk}"
+        first_activity = f"updates {update + 1} to {update + config.chunk}"
         self._task = self._bar.add_task(first_activity, total=config.total_updates, completed=update)
 
     def __enter__(self) -> "ProgressDisplay":
         self._bar.start()
-        self._chunk_start = time.monotonic()
+        self._chunk_start = 0.0
         self._chunk_seconds = 0.0
         return self
 
@@ -884,12 +904,16 @@ class ProgressDisplay:
         """Show on the bar what happens between two chunks."""
         self._bar.update(self._task, description=activity)
 
+    def start_timing(self) -> None:
+        """Mark the start of a chunk's training, so that its speed excludes compilation."""
+        self._chunk_start = time.monotonic()
+
     def stop_timing(self) -> None:
         """Mark the end of a chunk's training, so that its speed excludes validation and saving."""
         self._chunk_seconds = time.monotonic() - self._chunk_start
 
     def show_chunk(self, metrics: SeedMetrics, update: int) -> None:
-        """Show the metrics of a chunk, and start timing the next one."""
+        """Show the metrics of a chunk."""
         config = self._config
         # Speed over all arms and seeds together.
         chunk_steps = config.chunk * config.steps_per_update * config.seeds * len(metrics)
@@ -916,4 +940,3 @@ class ProgressDisplay:
         is_line_due = (update // config.chunk) % _CHUNKS_PER_LINE == 0 or update == config.total_updates
         if not self._console.is_terminal and is_line_due:
             self._console.print(progress_line)
-        self._chunk_start = time.monotonic()

@@ -150,6 +150,20 @@ class Trainer:
                 new_states[arm].append(self._keep_best_functions[arm](state, jnp.float32(score)))
         return new_states
 
+    def compile(self, arm: str, states: TrainerStates, env_params: EnvParams, stage_index: int = 0) -> bool:
+        """Compile a chunk of updates of an arm in a stage, for arguments like these, unless this is done.
+
+        Returns:
+          True if the program was compiled now.
+        """
+        if (arm, stage_index) in self._compiled:
+            return False
+        learner = self._stage_learner(arm, stage_index)
+        state = self._state_argument(states[arm])
+        arguments = (state, self._scalars_argument(stage_index), env_params, self._knowledge)
+        self._compiled[arm, stage_index] = self._compile_train(learner, arguments)
+        return True
+
     def train(
         self, states: TrainerStates, env_params: EnvParams, stage_index: int = 0
     ) -> tuple[TrainerStates, SeedMetrics]:
@@ -164,15 +178,14 @@ class Trainer:
           The states after the chunk, and its metrics.
         """
         # One arm at a time: a compilation takes half a gigabyte, and two in parallel are hardly faster.
-        train_functions = {}
         for arm in self.learners:
-            train_functions[arm] = self._compiled_train(arm, stage_index, states[arm][0], env_params)
+            self.compile(arm, states, env_params, stage_index)
 
         def train_seed(job: tuple[str, int]) -> Any:
             arm, policy_index = job
             scalars = self._policy_scalars(stage_index, policy_index)
-            result = train_functions[arm](states[arm][policy_index], scalars, env_params, self._knowledge)
-            return jax.block_until_ready(result)
+            train = self._compiled[arm, stage_index]
+            return jax.block_until_ready(train(states[arm][policy_index], scalars, env_params, self._knowledge))
 
         # Seeds of all arms run in threads, as many as there are cores.
         jobs = [(arm, policy_index) for policy_index in range(len(self._seeds)) for arm in self.learners]
@@ -195,13 +208,9 @@ class Trainer:
         """Learner of an arm in a stage."""
         return dataclasses.replace(self.learners[arm], stage=self._stages[stage_index])
 
-    def _compiled_train(self, arm: str, stage_index: int, state: LearnerState, env_params: EnvParams) -> Any:
-        """Compiled chunk of updates of an arm in a stage, for arguments like these."""
-        if (arm, stage_index) not in self._compiled:
-            learner = self._stage_learner(arm, stage_index)
-            arguments = (state, self._scalars_argument(stage_index), env_params, self._knowledge)
-            self._compiled[arm, stage_index] = self._compile_train(learner, arguments)
-        return self._compiled[arm, stage_index]
+    def _state_argument(self, arm_states: Any) -> LearnerState:
+        """State that the compiled function of an arm takes."""
+        return arm_states[0]
 
     def _scalars_argument(self, stage_index: int) -> PPOScalars:
         """Traced settings of a stage as the compiled function takes them."""
@@ -302,11 +311,14 @@ class ShardedTrainer(Trainer):
         self, states: TrainerStates, env_params: EnvParams, stage_index: int = 0
     ) -> tuple[TrainerStates, SeedMetrics]:
         """Do a chunk of updates in all seeds; see `Trainer.train`."""
+        for arm in self.learners:
+            self.compile(arm, states, env_params, stage_index)
+
         env_params = self._replicate_env_params(env_params)
         new_states: TrainerStates = {}
         metrics: SeedMetrics = {}
         for arm in self.learners:
-            train = self._compiled_train(arm, stage_index, states[arm], env_params)
+            train = self._compiled[arm, stage_index]
             new_states[arm], values = train(states[arm], self._stage_scalars[stage_index], env_params, self._knowledge)
 
             # Metrics come as one array [S] for each name.
@@ -322,6 +334,13 @@ class ShardedTrainer(Trainer):
             self._local_env_params = env_params
             self._replicated_env_params = replicate_on_devices(self._mesh, env_params)
         return self._replicated_env_params
+
+    def compile(self, arm: str, states: TrainerStates, env_params: EnvParams, stage_index: int = 0) -> bool:
+        """Compile a chunk of updates of an arm in a stage; see `Trainer.compile`."""
+        return super().compile(arm, states, self._replicate_env_params(env_params), stage_index)
+
+    def _state_argument(self, arm_states: Any) -> LearnerState:
+        return arm_states
 
     def _scalars_argument(self, stage_index: int) -> PPOScalars:
         return self._stage_scalars[stage_index]

@@ -17,7 +17,16 @@ FILE_LIMITS = tuple(f"nr_inodes={count}" for count in (2, 4, 6, 8, 12, 16, 24, 3
 
 
 #: First words of the lines about a training of the tiny run.
-STATUS_LINES = ("4 scenes", "layout ", "calibrating ", "learning ", "compiling ", "random walks", "update ")
+STATUS_LINES = (
+    "4 scenes",
+    "layout ",
+    "calibrating ",
+    "learning ",
+    "compiling ",
+    "compiled ",
+    "random walks",
+    "update ",
+)
 
 
 class DiskAttempt(NamedTuple):
