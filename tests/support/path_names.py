@@ -46,7 +46,10 @@ def try_name(name: str, run_dir: str) -> tuple[list[int], list[str]]:
             run_dir = str(working_dir / name)
         with contextlib.chdir(working_dir), contextlib.redirect_stdout(io.StringIO()):
             for _ in range(2):
-                exit_codes.append(train(config_file, run_dir, "--seeds", 1, "--arms", "baseline"))
+                try:
+                    exit_codes.append(train(config_file, run_dir, "--seeds", 1, "--arms", "baseline"))
+                except SystemExit as end:  # the parser refuses a word
+                    exit_codes.append(end.code)
 
         # The run holds its log; everything else of the folder was written outside of the run.
         expected_dir = os.path.relpath(os.path.join(working_dir, run_dir), folder)
