@@ -58,7 +58,7 @@ def measure_point(num_envs: int) -> dict:
     for seed in range(NUM_SEEDS):
         with tempfile.TemporaryDirectory() as folder:
             run_config = dataclasses.replace(config, seed=seed, total_steps=total_steps, run_dir=Path(folder) / "run")
-            last_row = jaxnav.train(run_config).log[-1]
+            last_row = jaxnav.train(run_config).log()[-1]
             success["argmax"].append(100 * last_row["val_success"])
             success["sample"].append(100 * last_row["val_success_sampled"])
     return {
