@@ -7,8 +7,8 @@ command ends with code 1 if the median of a ratio exceeds its limit. Without an 
 
 * `train` and `eval` are the commands of a smoke run, *cold* with an empty cache of compiled programs and *warm* with
   that of the cold call: wall seconds and peak memory.
-* `update` and `environment` are the seconds per step of `training.py` (all arms and seeds) and `environment.py` (the
-  sum of rows).
+* `update` and `environment` are the seconds per step of `training.py` (all arms and seeds) and `environment.py` (every
+  kind of output).
 """
 
 import contextlib
@@ -88,7 +88,9 @@ def measure(checkout: Path) -> dict[str, float]:
     training = run_benchmark(checkout, "training.py")
     values["update, us a step"] = 1e6 / training["steps_per_s"]["all arms and seeds"]["median"]
     environment = run_benchmark(checkout, "environment.py")
-    values["environment, ns a step"] = 1e9 / environment["steps_per_s"]["steps_sum_of_rows"]["median"]
+    for name, rate in environment["steps_per_s"].items():
+        if name.startswith("steps_"):
+            values[f"environment, {name.removeprefix('steps_')}, ns a step"] = 1e9 / rate["median"]
     return values
 
 
