@@ -679,7 +679,9 @@ def run_updates(session: TrainingSession, states: TrainerStates, update: int) ->
                 states = trainer.restart(states, env_params, stage_index)
 
             # Train, and validate if due.
-            _compile_training(session, progress, states, env_params, stage_index)
+            if not trainer.is_compiled(stage_index):
+                _compile_training(session, progress, states, env_params, stage_index)
+                progress.show_activity(f"updates {update + 1} to {update + config.chunk}")
             progress.start_timing()
             states, metrics = trainer.train(states, env_params, stage_index)
             metrics = mark_undefined_means(metrics)
@@ -723,15 +725,14 @@ def _compile_training(
     env_params: EnvParams,
     stage_index: int,
 ) -> None:
-    """Compile the updates of every arm in a stage, unless this is done, and say how long it took."""
+    """Compile the updates of every arm in a stage, and say how long it took."""
     arm_times = []
     for arm in session.trainer.learners:
         progress.show_activity(f"compiling the training of arm {arm}")
         start = time.monotonic()
-        if session.trainer.compile(arm, states, env_params, stage_index):
-            arm_times.append(f"{arm} {time.monotonic() - start:.1f} s")
-    if arm_times:
-        session.console.print(f"compiled the training: {', '.join(arm_times)}")
+        session.trainer.compile(arm, states, env_params, stage_index)
+        arm_times.append(f"{arm} {time.monotonic() - start:.1f} s")
+    session.console.print(f"compiled the training: {', '.join(arm_times)}")
 
 
 def mark_undefined_means(metrics: SeedMetrics) -> SeedMetrics:

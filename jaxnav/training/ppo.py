@@ -596,7 +596,7 @@ def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
     `apply_gradient` multiplies by the learning rate. Skipped steps are counted in the state, without an upper limit.
     """
     chain = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5))
-    # All parameters are one vector here: array by array, a third of a training program's operations were these.
+    # All parameters are one vector here: array by array, these were 0.3 of all operations of a training program.
     return optax.flatten(optax.apply_if_finite(chain, max_consecutive_errors=2**30))
 
 

@@ -7,6 +7,7 @@ those in a checkpoint.
 """
 
 import dataclasses
+import functools
 import operator
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -92,7 +93,9 @@ class Trainer:
 
     def abstract_states(self, env_params: EnvParams) -> SeedStates:
         """Shapes, dtypes and shardings of all states in a checkpoint."""
-        return jax.eval_shape(self._abstract_init, env_params)
+        # Functions that are not jitted, because JAX traces no options of the compiler.
+        init_functions = {arm: self._stage_learner(arm, 0).init for arm in self.learners}
+        return jax.eval_shape(functools.partial(self._init_seeds, init_functions), env_params)
 
     def pack(self, seed_states: SeedStates) -> TrainerStates:
         """Convert states from those in a checkpoint."""
@@ -105,11 +108,6 @@ class Trainer:
     def init(self, env_params: EnvParams) -> TrainerStates:
         """Start all seeds, each with a key of its own."""
         return self._init_seeds(self._init_functions, env_params)
-
-    def _abstract_init(self, env_params: EnvParams) -> SeedStates:
-        """Start all seeds by functions that are not jitted: JAX traces no options of the compiler."""
-        init_functions = {arm: self._stage_learner(arm, 0).init for arm in self.learners}
-        return self._init_seeds(init_functions, env_params)
 
     def _init_seeds(
         self, init_functions: Mapping[str, Callable[..., LearnerState]], env_params: EnvParams
@@ -150,19 +148,18 @@ class Trainer:
                 new_states[arm].append(self._keep_best_functions[arm](state, jnp.float32(score)))
         return new_states
 
-    def compile(self, arm: str, states: TrainerStates, env_params: EnvParams, stage_index: int = 0) -> bool:
-        """Compile a chunk of updates of an arm in a stage, for arguments like these, unless this is done.
+    def is_compiled(self, stage_index: int) -> bool:
+        """True if the updates of every arm in a stage are compiled."""
+        return all((arm, stage_index) in self._compiled for arm in self.learners)
 
-        Returns:
-          True if the program was compiled now.
-        """
+    def compile(self, arm: str, states: TrainerStates, env_params: EnvParams, stage_index: int = 0) -> None:
+        """Compile a chunk of updates of an arm in a stage, for arguments like these, unless this is done."""
         if (arm, stage_index) in self._compiled:
-            return False
+            return
         learner = self._stage_learner(arm, stage_index)
         state = self._state_argument(states[arm])
         arguments = (state, self._scalars_argument(stage_index), env_params, self._knowledge)
         self._compiled[arm, stage_index] = self._compile_train(learner, arguments)
-        return True
 
     def train(
         self, states: TrainerStates, env_params: EnvParams, stage_index: int = 0
@@ -335,9 +332,9 @@ class ShardedTrainer(Trainer):
             self._replicated_env_params = replicate_on_devices(self._mesh, env_params)
         return self._replicated_env_params
 
-    def compile(self, arm: str, states: TrainerStates, env_params: EnvParams, stage_index: int = 0) -> bool:
+    def compile(self, arm: str, states: TrainerStates, env_params: EnvParams, stage_index: int = 0) -> None:
         """Compile a chunk of updates of an arm in a stage; see `Trainer.compile`."""
-        return super().compile(arm, states, self._replicate_env_params(env_params), stage_index)
+        super().compile(arm, states, self._replicate_env_params(env_params), stage_index)
 
     def _state_argument(self, arm_states: Any) -> LearnerState:
         return arm_states

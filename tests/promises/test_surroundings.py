@@ -51,6 +51,21 @@ def test_commands_leave_the_64_bit_mode():
     assert run_command(lambda _: require_float32()) == 0
 
 
+@pytest.fixture
+def no_jit():
+    jax.config.update("jax_disable_jit", True)
+    yield
+    jax.config.update("jax_disable_jit", False)
+
+
+@pytest.mark.usefixtures("no_jit")
+def test_commands_ignore_that_nothing_shall_be_compiled(capsys):
+    modes = []
+    assert run_command(lambda _: modes.append(jax.config.values["jax_disable_jit"])) == 0
+    assert modes == [False]
+    assert "JAX_DISABLE_JIT is ignored" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_commands_compile_with_a_warning_where_jax_is_told_not_to(tmp_path):
     # An episode takes more than a minute where nothing is compiled.
