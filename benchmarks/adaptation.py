@@ -104,8 +104,9 @@ def measure_windows(
     def learned_loss(fast: FastWeights) -> jax.Array:
         zero_changes = {}
         for layer, factors in fast.layer_changes.items():
-            zero_changes[layer] = jnp.zeros_like(factors.outputs[:WINDOW])
-        return cast(HasLearnedLoss, policy.method).learned_loss(replay_window(policy, fast, zero_changes)[0])
+            zero_changes[layer] = jnp.zeros_like(factors.outputs[..., :WINDOW, :])
+        rows, _ = replay_window(policy, fast.window, fast.layer_changes, zero_changes)
+        return cast(HasLearnedLoss, policy.method).learned_loss(rows)
 
     def step(agent: Agent, key: jax.Array) -> tuple[Agent, tuple[jax.Array, ...]]:
         memory = policy_memory(agent)
@@ -121,7 +122,7 @@ def measure_windows(
         choice = jax.random.categorical(key, decision.logits)
         keys = jax.random.split(key, NUM_EPISODES)
         agent, _ = agent_loop.step(agent, choice, knowledge, params, policy=policy, decision=decision, reset_keys=keys)
-        losses = (jax.vmap(learned_loss)(fast_before), jax.vmap(learned_loss)(fast_after))
+        losses = (learned_loss(fast_before), learned_loss(fast_after))
         return agent, (is_complete & is_adapting, *losses)
 
     memory = policy.initial_memory((NUM_EPISODES,))

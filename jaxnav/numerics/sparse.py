@@ -17,7 +17,7 @@ from jaxnav.numerics.trees import tree_where
 #: Number of parts of a batch, which are computed one after the other or skipped.
 _NUM_PARTS = 8
 
-#: Maps (shared, inputs of one member, state of one member) to the member's next state.
+#: Maps (shared, inputs of some members, state of these members) to their next state.
 Function = Callable[[Any, Any, Any], Any]
 
 
@@ -29,8 +29,8 @@ def update_where(mask: jax.Array, function: Function, shared: Any, inputs: Any, 
 
     Args:
       mask: bool [...].
-      function: maps `shared` and leaves of `inputs` and `state` without a batch to the next state. In reverse mode
-        gradients reach these three and no other array that the function closes over.
+      function: maps `shared` and the leaves [P, ...] of `inputs` and `state` of P members to their next state, each
+        member for itself. In reverse mode gradients reach these three and no other array that the function closes over.
       shared: a pytree of float arrays.
       inputs: leaves [..., ...].
       state: float leaves [..., ...].
@@ -61,7 +61,7 @@ def _update(function: Function, shared: Any, mask: jax.Array, inputs: Any, state
 
 def _update_members(function: Function, shared: Any, mask: jax.Array, inputs: Any, state: Any) -> Any:
     """Update the members of one part; unmasked members keep their state."""
-    next_state = jax.vmap(function, (None, 0, 0))(shared, inputs, state)
+    next_state = function(shared, inputs, state)
     return tree_where(mask, next_state, state)
 
 

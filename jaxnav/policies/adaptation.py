@@ -17,17 +17,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import nnx
 
 from jaxnav.errors import InputError
 from jaxnav.numerics.product import Linear
+from jaxnav.numerics.recurrence import gru_step
 from jaxnav.numerics.sparse import update_where
+from jaxnav.policies.network import Policy, Stream
 from jaxnav.policies.pathways import Decision, Pathways, PolicyState
 
 if TYPE_CHECKING:
     from jaxnav.policies.method import Adaptation
-    from jaxnav.policies.network import Policy
 
 
 #: Number of decisions between two inner steps; the learned loss reads all of them.
@@ -81,9 +81,25 @@ class LowRankChange(NamedTuple):
     outputs: jax.Array
 
     def __call__(self, inputs: jax.Array) -> jax.Array:
-        """Return the change of the layer's output [..., N] for inputs [..., M]."""
-        similarity = (self.inputs * inputs[..., None, :]).sum(axis=-1, keepdims=True)
-        return (similarity * self.outputs).sum(axis=-2)
+        """Return the change of the layer's output [..., D, N] for the inputs [..., D, M] of D decisions."""
+        similarity = inputs @ jnp.swapaxes(self.inputs, -1, -2)  # [..., D, R]
+        return similarity @ self.outputs
+
+
+class Window(NamedTuple):
+    """The last decisions of an episode, from which the next inner step learns; the latest is at the end.
+
+    Attributes:
+      start: float32 [..., H], hidden state before the first decision.
+      fuse_inputs: float32 [..., W, M], inputs of the fusing layer, with a 1 for its bias.
+      fused: float32 [..., W, H + 1], rectified outputs of the fusing layer, with a 1 for the bias of the next layer.
+      done_gate: float32 [..., W, 1], gates of Done's logit.
+    """
+
+    start: jax.Array
+    fuse_inputs: jax.Array
+    fused: jax.Array
+    done_gate: jax.Array
 
 
 class FastWeights(NamedTuple):
@@ -91,17 +107,13 @@ class FastWeights(NamedTuple):
 
     Attributes:
       num_decisions: int32 [...], decisions so far.
-      window_start: float32 [..., H], the hidden state before the window.
-      window_pathways: float32 [..., W, P], all pathways of the last decisions, joined; the latest is at the end.
-      window_actions: int32 [..., W], the action before each of these decisions.
+      window: the last `WINDOW` decisions.
       layer_changes: the change of each layer, a row for every decision of the windows so far, in order; the rows of
         later windows are 0.
     """
 
     num_decisions: jax.Array
-    window_start: jax.Array
-    window_pathways: jax.Array
-    window_actions: jax.Array
+    window: Window
     layer_changes: dict[str, LowRankChange]
 
 
@@ -134,7 +146,7 @@ class LearnedLossAdaptation:
                 f"LearnedLossAdaptation: inner_steps is {self.inner_steps}; give 1 or more, or omit the adaptation"
             )
 
-    def init(self, policy: "Policy", batch: tuple[int, ...]) -> FastWeights:
+    def init(self, policy: Policy, batch: tuple[int, ...]) -> FastWeights:
         """Return fast weights without any change, and an empty window."""
         # One row for every decision of every window.
         rank = self.inner_steps * WINDOW
@@ -144,59 +156,70 @@ class LearnedLossAdaptation:
             outputs = jnp.zeros((*batch, rank, output_width))
             layer_changes[layer] = LowRankChange(inputs, outputs)
 
-        return FastWeights(
-            num_decisions=jnp.zeros(batch, jnp.int32),
-            window_start=jnp.zeros((*batch, len(policy.recurrent_kernel))),
-            window_pathways=jnp.zeros((*batch, WINDOW, sum(policy.pathway_widths))),
-            window_actions=jnp.zeros((*batch, WINDOW), jnp.int32),
-            layer_changes=layer_changes,
+        window = Window(
+            start=jnp.zeros((*batch, policy.hidden)),
+            fuse_inputs=jnp.zeros((*batch, WINDOW, policy.layer_widths["fuse"][0])),
+            fused=jnp.zeros((*batch, WINDOW, policy.hidden + 1)),
+            done_gate=jnp.zeros((*batch, WINDOW, 1)),
         )
+        return FastWeights(jnp.zeros(batch, jnp.int32), window, layer_changes)
 
-    def decide(self, policy: "Policy", pathways: Pathways, memory: PolicyState) -> Decision:
+    def decide(self, policy: Policy, pathways: Pathways, memory: PolicyState) -> Decision:
         """Decide with the changed layers, then adapt where the window is full."""
-        fast = _append_decision(memory.fast, policy.adaptable_pathways(pathways), memory)
-        output = policy.decide_with_changes(pathways, memory, dict(fast.layer_changes))
+        # Record the input of every layer while its output is changed.
+        layer_inputs: dict[str, jax.Array] = {}
+
+        def change_output(layer: str, inputs: jax.Array) -> jax.Array:
+            layer_inputs[layer] = inputs
+            return memory.fast.layer_changes[layer](inputs[..., None, :])[..., 0, :]
+
+        changes = {layer: functools.partial(change_output, layer) for layer in memory.fast.layer_changes}
+        output = policy.decide_with_changes(pathways, memory, changes)
+
+        fast = _append_decision(memory.fast, layer_inputs, pathways.gate)
         return output._replace(fast=self.adapt_if_due(policy, fast))
 
-    def adapt_if_due(self, policy: "Policy", fast: FastWeights) -> FastWeights:
+    def adapt_if_due(self, policy: Policy, fast: FastWeights) -> FastWeights:
         """Take an inner step in the episodes whose window is full."""
         # The window is full after every `WINDOW` decisions, as long as the episode has inner steps left.
         is_full = (fast.num_decisions % WINDOW == 0) & (fast.num_decisions <= self.inner_steps * WINDOW)
         graph, params = nnx.split(policy)
 
-        def adapt_episode(
-            params: Any, window: FastWeights, layer_changes: dict[str, LowRankChange]
+        def adapt_episodes(
+            params: Any, fast: FastWeights, layer_changes: dict[str, LowRankChange]
         ) -> dict[str, LowRankChange]:
-            """Write the W rows of this window's step, of one episode."""
-            merged_policy = nnx.merge(graph, params)
-            step_changes = self.compute_inner_step(merged_policy, window._replace(layer_changes=layer_changes))
-            first_row = window.num_decisions - WINDOW
-            write_rows = functools.partial(jax.lax.dynamic_update_slice_in_dim, start_index=first_row, axis=0)
-            return jax.tree.map(write_rows, layer_changes, step_changes)
+            """Write the W rows of this window's step, of some episodes."""
+            step_changes = self.compute_inner_step(nnx.merge(graph, params), fast.window, layer_changes)
+            write_rows = jax.vmap(functools.partial(jax.lax.dynamic_update_slice_in_dim, axis=0))
+            first_row = fast.num_decisions - WINDOW
+            return jax.tree.map(lambda rows, new: write_rows(rows, new, first_row), layer_changes, step_changes)
 
         # Few windows of a batch are full at a time, and only these are read and written.
-        window = fast._replace(layer_changes={})
-        layer_changes = update_where(is_full, adapt_episode, params, window, fast.layer_changes)
+        inputs = fast._replace(layer_changes={})
+        layer_changes = update_where(is_full, adapt_episodes, params, inputs, fast.layer_changes)
         return fast._replace(layer_changes=layer_changes)
 
-    def compute_inner_step(self, policy: "Policy", fast: FastWeights) -> dict[str, LowRankChange]:
-        """Return the changes of one inner step, [W, ...] for each layer, of one episode."""
+    def compute_inner_step(
+        self, policy: Policy, window: Window, layer_changes: dict[str, LowRankChange]
+    ) -> dict[str, LowRankChange]:
+        """Return the changes of one inner step, [..., W, ...] for each layer."""
         learned_loss = cast(HasLearnedLoss, policy.method).learned_loss
         # First order: stop gradients of training everywhere but in the loss, which nothing else would train.
         if not self.second_order:
             graph, params = nnx.split(policy)
             policy = nnx.merge(graph, jax.lax.stop_gradient(params))
-            fast = jax.lax.stop_gradient(fast)
+            window, layer_changes = jax.lax.stop_gradient((window, layer_changes))
 
         def window_loss(output_changes: dict[str, jax.Array]) -> tuple[jax.Array, dict[str, jax.Array]]:
-            rows, layer_inputs = replay_window(policy, fast, output_changes)
-            return learned_loss(rows), layer_inputs
+            rows, layer_inputs = replay_window(policy, window, layer_changes, output_changes)
+            # Episodes are independent, so the gradient of the sum is that of each episode.
+            return learned_loss(rows).sum(), layer_inputs
 
         # The gradient of a kernel is the sum over the window of input (x) gradient by the output, so differentiate by
         # a change of the outputs that is zero.
         no_changes: dict[str, jax.Array] = {}
-        for layer, change in fast.layer_changes.items():
-            no_changes[layer] = jnp.zeros_like(change.outputs[:WINDOW])
+        for layer, change in layer_changes.items():
+            no_changes[layer] = jnp.zeros_like(change.outputs[..., :WINDOW, :])
         output_gradients, layer_inputs = jax.grad(window_loss, has_aux=True)(no_changes)
 
         # Descend: inputs and scaled gradients of the outputs are the two factors of the change.
@@ -224,64 +247,63 @@ def limit_inner_steps(adaptation: "Adaptation | None", inner_steps: int) -> "Ada
 
 
 def replay_window(
-    policy: "Policy", fast: FastWeights, output_changes: dict[str, jax.Array]
+    policy: Policy,
+    window: Window,
+    layer_changes: dict[str, LowRankChange],
+    output_changes: dict[str, jax.Array],
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Repeat the decisions of one episode's window.
+    """Repeat the decisions of a window from the outputs of the fusing layer; with streams, those of the direct stream.
 
     Args:
       policy: the policy that decided.
-      fast: leaves without a batch.
-      output_changes: float32 [W, N] for each layer, added to its outputs in addition to its change.
+      window: leaves [...].
+      layer_changes: the change of each layer while the window was decided, leaves [...].
+      output_changes: float32 [..., W, N] for each layer, added to its outputs in addition to its change.
 
     Returns:
-      Rows float32 [W, H + A] of hidden state and action probabilities, and the inputs [W, M] of each layer.
+      Rows float32 [..., W, H + A] of hidden state and action probabilities, and the inputs [..., W, M] of each layer.
     """
-    # Pathways are stored joined, [P]; split them at the end of each but the last.
-    pathway_ends = np.cumsum(policy.pathway_widths)[:-1]
+    layer_inputs = {"fuse": window.fuse_inputs}
 
-    def repeat_decision(
-        hidden: jax.Array, decision_inputs: tuple[jax.Array, jax.Array, dict[str, jax.Array]]
-    ) -> tuple[jax.Array, Any]:
-        joined_pathways, action, step_changes = decision_inputs
-        pathways = Pathways(*jnp.split(joined_pathways, pathway_ends))
+    def change_output(layer: str, inputs: jax.Array) -> jax.Array:
+        layer_inputs[layer] = inputs
+        return layer_changes[layer](inputs) + output_changes[layer]
 
-        # Record the input of every layer while its output is changed.
-        layer_inputs: dict[str, jax.Array] = {}
+    changes = {layer: functools.partial(change_output, layer) for layer in ("input_gates", "actor")}
 
-        def change_output(layer: str, inputs: jax.Array) -> jax.Array:
-            layer_inputs[layer] = inputs
-            return fast.layer_changes[layer](inputs) + step_changes[layer]
+    # Gates of all decisions at once, [..., W, 3 H]; the rectifier of a change of 0 passes on where `fused` is positive.
+    input_gates = Stream.input_gates(policy, window.fused[..., :-1] + output_changes["fuse"], changes)
 
-        changes = {layer: functools.partial(change_output, layer) for layer in step_changes}
-        output = policy.decide_with_changes(pathways, PolicyState(hidden, action), changes)
+    # The recurrent core, decision by decision.
+    def step_core(hidden: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, Any]:
+        input_gates, output_change = inputs
+        change = layer_changes["hidden_gates"](hidden[..., None, :])[..., 0, :]
+        hidden_gates = Stream.hidden_gates(policy, hidden) + change + output_change
+        next_hidden = gru_step(input_gates, hidden_gates, hidden)
+        return next_hidden, (hidden, next_hidden)
 
-        # With streams the loss reads the hidden state of the direct stream, which is the first.
-        row = jnp.concatenate([output.hidden[: policy.hidden], jax.nn.softmax(output.logits)])
-        return output.hidden, (row, layer_inputs)
+    time_first = functools.partial(jnp.moveaxis, source=-2, destination=0)
+    core_inputs = time_first(input_gates), time_first(output_changes["hidden_gates"])
+    _, hidden_states = jax.lax.scan(step_core, window.start, core_inputs, unroll=WINDOW)
+    layer_inputs["hidden_gates"], hidden = (jnp.moveaxis(states, 0, -2) for states in hidden_states)
 
-    # Repeat the W decisions in order, from the hidden state before the window.
-    window = (fast.window_pathways, fast.window_actions, output_changes)
-    _, (rows, layer_inputs) = jax.lax.scan(repeat_decision, fast.window_start, window)
-    return rows, layer_inputs
+    # Action probabilities of all decisions at once.
+    logits = policy.action_logits(hidden, window.done_gate, changes)
+    return jnp.concatenate([hidden, jax.nn.softmax(logits)], axis=-1), layer_inputs
 
 
-def _append_decision(fast: FastWeights, pathways: Pathways, memory: PolicyState) -> FastWeights:
+def _append_decision(fast: FastWeights, layer_inputs: dict[str, jax.Array], done_gate: jax.Array) -> FastWeights:
     """Append the inputs of a decision to the window."""
-    # Join the pathways, [..., P]; `reading`, the last field, is none.
-    joined_pathways = jnp.concatenate(pathways[:-1], axis=-1)
 
-    # The window [..., W, P] follows the axes of the batch.
-    window_axis = memory.action.ndim
-
-    def shift_in(window: jax.Array, latest: jax.Array) -> jax.Array:
-        remaining = jax.lax.slice_in_dim(window, 1, None, axis=window_axis)
-        return jnp.concatenate([remaining, jnp.expand_dims(latest, window_axis)], window_axis)
+    def shift_in(rows: jax.Array, latest: jax.Array) -> jax.Array:
+        return jnp.concatenate([rows[..., 1:, :], latest[..., None, :]], axis=-2)
 
     # The hidden state is only needed from before the first decision of a window.
     is_first = (fast.num_decisions % WINDOW == 0)[..., None]
-    return fast._replace(
-        num_decisions=fast.num_decisions + 1,
-        window_start=jnp.where(is_first, memory.hidden, fast.window_start),
-        window_pathways=shift_in(fast.window_pathways, joined_pathways),
-        window_actions=shift_in(fast.window_actions, memory.action),
+    window = Window(
+        start=jnp.where(is_first, layer_inputs["hidden_gates"], fast.window.start),
+        fuse_inputs=shift_in(fast.window.fuse_inputs, layer_inputs["fuse"]),
+        fused=shift_in(fast.window.fused, layer_inputs["input_gates"]),
+        done_gate=shift_in(fast.window.done_gate, done_gate),
     )
+    return fast._replace(num_decisions=fast.num_decisions + 1, window=window)

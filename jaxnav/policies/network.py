@@ -163,18 +163,22 @@ class Stream(nnx.Module):
 
     def apply_heads(self, hidden: jax.Array, pathways: Pathways, changes: LayerChanges = NO_CHANGES) -> Decision:
         """Compute logits [..., A] and value [...] from a hidden state float32 [..., H]."""
+        # The critic has no changes: an adaptation is about actions.
+        logits = self.action_logits(hidden, pathways.gate, changes)
+        return Decision(logits=logits, value=self.critic(hidden)[..., 0], hidden=hidden)
+
+    def action_logits(self, hidden: jax.Array, gate: jax.Array, changes: LayerChanges = NO_CHANGES) -> jax.Array:
+        """Compute logits [..., A] from a hidden state float32 [..., H] and the gate of Done [..., 1]."""
         logits = self.actor(hidden)
         if "actor" in changes:
             logits = logits + changes["actor"](append_one(hidden))
-        # The critic has no changes: an adaptation is about actions.
-        value = self.critic(hidden)[..., 0]
-        return Decision(logits=self.gate_done(logits, pathways), value=value, hidden=hidden)
+        return self.gate_done(logits, gate)
 
-    def gate_done(self, logits: jax.Array, pathways: Pathways) -> jax.Array:
+    def gate_done(self, logits: jax.Array, gate: jax.Array) -> jax.Array:
         """Multiply the logit of Done, in logits [..., A], by the gate [..., 1] if `done_gate` is set."""
         if not self.done_gate:
             return logits
-        return jnp.concatenate([logits[..., :DONE], pathways.gate * logits[..., DONE:]], axis=-1)
+        return jnp.concatenate([logits[..., :DONE], gate * logits[..., DONE:]], axis=-1)
 
     @property
     def layer_widths(self) -> dict[str, tuple[int, int]]:
@@ -365,10 +369,6 @@ class Policy(Stream):
             memory = memory._replace(counterfactual_hidden=jnp.zeros((*batch, self.hidden)))
         return memory if self.adaptation is None else memory._replace(fast=self.adaptation.init(self, batch))
 
-    def adaptable_pathways(self, pathways: Pathways) -> Pathways:
-        """Pathways that an adaptation learns from: all of them."""
-        return pathways
-
     @property
     def needs_stepwise_replay(self) -> bool:
         """True if training must unroll the policy step by step, because experience or adaptation reads the memory."""
@@ -520,10 +520,6 @@ class StreamsPolicy(Policy):
         """Return the memory at the start of an episode, leaves [*batch, ...]."""
         memory = super().initial_memory(batch)
         return memory._replace(hidden=jnp.zeros((*batch, 2 * self.hidden)), use_experience=jnp.ones(batch))
-
-    def adaptable_pathways(self, pathways: Pathways) -> Pathways:
-        """Pathways that an adaptation learns from: the direct ones, as if the direct stream acted alone."""
-        return do(pathways, experience=0.0)
 
     @property
     def experience_appearance(self) -> jax.Array:

@@ -13,9 +13,9 @@ from jaxnav.numerics.sparse import update_where
 
 
 def cubic_update(weight, inputs, state):
-    """The next state of one member: a number and a vector that depend on weight, input and state."""
+    """The next state of some members: a number and a vector that depend on weight, input and state."""
     cubes = inputs["a"] ** 3
-    return {"sum": weight * cubes.sum() * state["sum"], "rows": weight * cubes + state["rows"]}
+    return {"sum": weight * cubes.sum(axis=-1) * state["sum"], "rows": weight * cubes + state["rows"]}
 
 
 def random_batch(seed, *shape):
@@ -34,10 +34,7 @@ def update_masked(mask, weight, inputs, state):
 
 def update_all_then_restore(mask, weight, inputs, state):
     """Update all members, and restore those outside the mask."""
-    update = cubic_update
-    for _ in mask.shape:
-        update = jax.vmap(update, (None, 0, 0))
-    next_state = update(weight, inputs, state)
+    next_state = cubic_update(weight, inputs, state)
 
     def select(new_leaf, old_leaf):
         leaf_mask = mask.reshape(mask.shape + (1,) * (new_leaf.ndim - mask.ndim))

@@ -124,7 +124,9 @@ def window_loss(spec, window, method_weights, fast_layers):
         masked_pathways = mask_experience(pathways, use_experience)
         decision = policy.decide_with_changes(masked_pathways, memory._replace(hidden=hidden))
         hidden = decision.hidden
-        rows.append(jnp.concatenate([hidden[: policy.hidden], jax.nn.softmax(decision.logits)]))
+        direct_hidden = hidden[: policy.hidden]
+        probs = jax.nn.softmax(policy.action_logits(direct_hidden, pathways.gate))
+        rows.append(jnp.concatenate([direct_hidden, probs]))
     return cast(HasLearnedLoss, policy.method).learned_loss(jnp.stack(rows))
 
 
@@ -256,8 +258,8 @@ def test_replay_window_repeats_the_decisions_of_the_window():
     no_output_changes = {}
     for layer_name, factors in layer_changes.items():
         no_output_changes[layer_name] = jnp.zeros_like(factors.outputs[:WINDOW])
-    fast = last_decision.fast._replace(layer_changes=layer_changes)
-    rows, layer_inputs = replay_window(policy, fast, no_output_changes)
+    window = last_decision.fast.window
+    rows, layer_inputs = replay_window(policy, window, layer_changes, no_output_changes)
 
     last_probs = jax.nn.softmax(last_decision.logits)
     np.testing.assert_allclose(rows[:, : policy.hidden], decisions.hidden[WINDOW:], rtol=1e-5, atol=1e-6)

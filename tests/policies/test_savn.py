@@ -95,8 +95,11 @@ def fall(weights, steps):
     policy = ACTING.bind(weights)
 
     def loss(fast):
-        nothing = {layer: jnp.zeros_like(factors.outputs[:WINDOW]) for layer, factors in fast.layer_changes.items()}
-        return policy.method.learned_loss(replay_window(policy, fast, nothing)[0])  # type: ignore[attr-defined]
+        nothing = {}
+        for layer, factors in fast.layer_changes.items():
+            nothing[layer] = jnp.zeros_like(factors.outputs[..., :WINDOW, :])
+        rows, _ = replay_window(policy, fast.window, fast.layer_changes, nothing)
+        return policy.method.learned_loss(rows)  # type: ignore[attr-defined]
 
     def step(agent, key):
         memory = policy_memory(agent)
@@ -105,7 +108,7 @@ def fall(weights, steps):
         choice, keys = jax.random.categorical(key, decision.logits), jax.random.split(key, ENVS)
         agent, _ = ACTING.step(agent, choice, KNOWLEDGE, LONG, policy=policy, decision=decision, reset_keys=keys)
         full = (after.num_decisions % WINDOW == 0) & (after.num_decisions <= 4 * WINDOW)
-        return agent, (full, jax.vmap(loss)(before), jax.vmap(loss)(after))
+        return agent, (full, loss(before), loss(after))
 
     agent = ACTING.start(jax.random.key(0), ENVS, policy.initial_memory((ENVS,)), KNOWLEDGE, LONG)
     return jax.lax.scan(step, agent, jax.random.split(jax.random.key(1), steps))[1]

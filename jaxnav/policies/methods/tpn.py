@@ -282,7 +282,7 @@ class TentativeAdaptation:
 
         # Negative gradient of the cross-entropy by the actor's kernel and bias: the outer product of [h, 1] and
         # one_hot - softmax(logits).
-        logits_descent = policy.gate_done(best_one_hot - jax.nn.softmax(output.logits), pathways)
+        logits_descent = policy.gate_done(best_one_hot - jax.nn.softmax(output.logits), pathways.gate)
         step = self.learning_rate * append_one(hidden_now)[..., None] * logits_descent[..., None, :]
         is_repeated = pathways.reading[..., None, None]
         actor_change = actor_change + jnp.where(is_repeated, step, 0.0)
