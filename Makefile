@@ -6,11 +6,14 @@ READY := .venv/.ready
 # Benchmarks whose report is stored in results/performance, for docs/performance.md and docs/scaling.md.
 BENCHMARKS := compile_time compiling environment estimator growth inference methods peers scaling seeds streaming sweep \
   training training_peers utilisation
+# Benchmarks of an accelerator, and the folder of their reports.
+GPU_BENCHMARKS := environment training methods estimator episodes
+GPU_RESULTS := results/performance/gpu
 VERSION = $(shell sed -n 's/^version = "\(.*\)"$$/\1/p' pyproject.toml)
 # Version of the topmost section of the changelog.
 CHANGES = $(shell sed -n 's/^\#\# \[\([^]]*\)\].*/\1/p' CHANGELOG.md | head -n 1)
 
-.PHONY: help setup run test lint docs test-slow test-exhaustive coverage mutants gate versions bench package release lock clean
+.PHONY: help setup run test lint docs test-slow test-exhaustive coverage mutants gate versions bench bench-gpu package release lock clean
 
 help:
 	@echo 'make run        train on generated rooms, then evaluate the run (runs/rooms)'
@@ -23,6 +26,7 @@ help:
 	@echo 'make versions   the fast tests on every Python, with the oldest and the newest packages'
 	@echo 'make docs       build the documentation, site/index.html'
 	@echo 'make bench      run every benchmark, and update results/performance and the tables of the documentation'
+	@echo 'make bench-gpu  the benchmarks of docs/gpu.md on a GPU, into results/performance/gpu'
 	@echo 'make package    build the wheel and the source archive in dist/, and try the wheel in a new environment'
 	@echo 'make release    make package for a committed version with a changelog; uploads and tags nothing'
 	@echo 'make setup      only install .venv;  make lock  pin newer versions;  make clean  remove what was built'
@@ -94,6 +98,14 @@ bench: $(READY)
 	  if $(BIN)/python benchmarks/$$name.py > $$result.new; then mv $$result.new $$result; \
 	  else rm -f $$result.new; failed="$$failed $$name"; fi; done; \
 	$(BIN)/python benchmarks/table.py && $(BIN)/python benchmarks/simulate.py || exit 1; \
+	test -z "$$failed" || { echo "failed:$$failed" >&2; exit 1; }
+
+# Needs JAX for CUDA in .venv, see docs/gpu.md. Without full precision a GPU rounds the factors of matrix products.
+bench-gpu: $(READY)
+	@mkdir -p $(GPU_RESULTS); failed=; for name in $(GPU_BENCHMARKS); do \
+	  echo "== $$name"; result=$(GPU_RESULTS)/$$name.json; \
+	  if JAX_DEFAULT_MATMUL_PRECISION=highest $(BIN)/python benchmarks/$$name.py > $$result.new; then \
+	  mv $$result.new $$result; else rm -f $$result.new; failed="$$failed $$name"; fi; done; \
 	test -z "$$failed" || { echo "failed:$$failed" >&2; exit 1; }
 
 # Builds the source archive, and the wheel from it. The wheel is tried where there are no sources.

@@ -86,6 +86,12 @@ def peak_resident_gb() -> float:
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 3)
 
 
+def peak_device_gb() -> float | None:
+    """Return the peak of the first device's own memory; None for a CPU, which uses that of the process."""
+    memory_stats = jax.local_devices()[0].memory_stats()
+    return round(memory_stats["peak_bytes_in_use"] / 2**30, 3) if memory_stats else None
+
+
 # Reports
 
 

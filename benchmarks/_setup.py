@@ -17,6 +17,7 @@ from jaxnav.runs.config import RunConfig
 from jaxnav.runs.train import explore_world, learn_knowledge, make_trainer
 from jaxnav.runs.worlds import CompiledWorld, compile_training_world
 from jaxnav.training.calibration import Exploration
+from jaxnav.training.devices import Devices
 from jaxnav.training.ppo import LearnerState, PPOScalars
 from jaxnav.training.trainer import Trainer
 
@@ -48,6 +49,13 @@ class TrainingSetup(NamedTuple):
         key = jax.random.key(self.config.seed)
         state = jax.jit(learner.init)(key, self.params, self.knowledge)
         return state, self.config.ppo.scalars(self.config.total_updates), self.params, self.knowledge
+
+
+def accelerator_mesh(config: RunConfig) -> Mesh | None:
+    """Return the mesh of `--devices 1` on an accelerator, where seeds train as one batch; None on a CPU."""
+    if jax.default_backend() == "cpu":
+        return None
+    return Devices(count=1).mesh(config.seeds, config.ppo.num_envs, config.ppo.minibatches)
 
 
 def set_up_training(config: RunConfig, mesh: Mesh | None = None, explore: bool = True) -> TrainingSetup:

@@ -14,8 +14,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from _common import peak_resident_gb, print_report, steps_per_second, summarize, time_in_turns
-from _setup import make_training_call, set_up_training
+from _common import peak_device_gb, peak_resident_gb, print_report, steps_per_second, summarize, time_in_turns
+from _setup import accelerator_mesh, make_training_call, set_up_training
 
 import jaxnav
 from jaxnav.runs.config import RunConfig
@@ -47,7 +47,8 @@ def measure_point(num_envs: int) -> dict:
 
     # Speed of single chunks.
     setup = set_up_training(config)
-    trainer = make_trainer(config, setup.world.env, setup.estimator_config, setup.knowledge)
+    mesh = accelerator_mesh(config)
+    trainer = make_trainer(config, setup.world.env, setup.estimator_config, setup.knowledge, mesh)
     call = make_training_call(trainer, trainer.init(setup.params), setup.params)
     update_times = time_in_turns({"chunk": call}, turns=3)["chunk"]
     rate = steps_per_second(update_times, config.chunk * config.steps_per_update)
@@ -58,6 +59,8 @@ def measure_point(num_envs: int) -> dict:
     for seed in range(NUM_SEEDS):
         with tempfile.TemporaryDirectory() as folder:
             run_config = dataclasses.replace(config, seed=seed, total_steps=total_steps, run_dir=Path(folder) / "run")
+            if mesh is not None:
+                run_config = dataclasses.replace(run_config, devices=1)
             last_row = jaxnav.train(run_config).log()[-1]
             success["argmax"].append(100 * last_row["val_success"])
             success["sample"].append(100 * last_row["val_success_sampled"])
@@ -66,6 +69,7 @@ def measure_point(num_envs: int) -> dict:
         "steps": total_steps,
         "success": {decoding: summarize(values, digits=3) for decoding, values in success.items()},
         "peak_resident_gb": peak_resident_gb(),
+        "peak_device_gb": peak_device_gb(),
     }
 
 

@@ -6,8 +6,8 @@ with one seed of each arm.
 
 import dataclasses
 
-from _common import peak_resident_gb, print_report, steps_per_second, time_in_turns
-from _setup import make_training_call, set_up_training
+from _common import peak_device_gb, peak_resident_gb, print_report, steps_per_second, time_in_turns
+from _setup import accelerator_mesh, make_training_call, set_up_training
 
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.train import make_trainer
@@ -26,7 +26,8 @@ def main() -> None:
         run_configs[arm] = dataclasses.replace(config, arms=(arm,), seeds=1)
     calls = {}
     for name, run_config in run_configs.items():
-        trainer = make_trainer(run_config, setup.world.env, setup.estimator_config, setup.knowledge)
+        mesh = accelerator_mesh(run_config)
+        trainer = make_trainer(run_config, setup.world.env, setup.estimator_config, setup.knowledge, mesh)
         calls[name] = make_training_call(trainer, trainer.init(setup.params), setup.params)
 
     times = time_in_turns(calls, TURNS)
@@ -41,6 +42,7 @@ def main() -> None:
             "seeds": config.seeds,
             "steps_per_s": rates,
             "peak_resident_gb": peak_resident_gb(),
+            "peak_device_gb": peak_device_gb(),
         }
     )
 

@@ -1,7 +1,8 @@
-"""Selection between pytrees of arrays, and of their rows."""
+"""Selection between pytrees of arrays and of their rows, and the size of pytrees."""
 
+import functools
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +31,17 @@ def tree_where(condition: jax.Array, on_true: Tree, on_false: Tree) -> Tree:
 def take_rows(tree: Tree, row_indices: jax.Array) -> Tree:
     """Take the rows `row_indices`, int [B], of leaves [E, ...]."""
     return jax.tree.map(lambda leaf: leaf[row_indices], tree)
+
+
+def abstract_bytes(tree: Any) -> int:
+    """Return the bytes of a tree of arrays, or of their shapes from `jax.eval_shape`."""
+    plain_tree = jax.eval_shape(functools.partial(jax.tree.map, _as_plain_array), tree)
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(plain_tree))
+
+
+def _as_plain_array(leaf: jax.Array) -> jax.Array:
+    """Return the words of typed PRNG keys, and all other arrays as they are."""
+    return jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
 
 
 def map_selected_rows(

@@ -41,6 +41,7 @@ from jaxnav.policies.network import Params
 from jaxnav.policies.testing import check_method
 from jaxnav.progress import show_activity
 from jaxnav.runs.config import RunConfig, check_config
+from jaxnav.runs.memory import format_bytes, require_memory
 from jaxnav.runs.policies import POLICIES_DIR, export_policy
 from jaxnav.runs.preparation import (
     PREPARATION_DIR,
@@ -605,6 +606,9 @@ def _restore_or_init(
     run_on_first_process(lambda: set_aside_checkpoints_after(config.run_dir, update))
     run_on_first_process(lambda: RunLogs(config).rewind(update))
 
+    require_memory(
+        trainer.state_bytes(env_params), "the state of training", "give fewer seeds or a smaller ppo.num_envs"
+    )
     if checkpoint is None:
         return trainer.init(env_params), 0
     console.print(f"resumed after update {update} of {config.total_updates}")
@@ -725,14 +729,20 @@ def _compile_training(
     env_params: EnvParams,
     stage_index: int,
 ) -> None:
-    """Compile the updates of every arm in a stage, and say how long it took."""
+    """Compile the updates of every arm in a stage, and say how long it took and how much memory they need.
+
+    Raises:
+      InputError: less memory is free.
+    """
     arm_times = []
     for arm in session.trainer.learners:
         progress.show_activity(f"compiling the training of arm {arm}")
         start = time.monotonic()
         session.trainer.compile(arm, states, env_params, stage_index)
         arm_times.append(f"{arm} {time.monotonic() - start:.1f} s")
-    session.console.print(f"compiled the training: {', '.join(arm_times)}")
+    num_bytes = session.trainer.temporary_bytes(stage_index)
+    session.console.print(f"compiled the training: {', '.join(arm_times)}; an update needs {format_bytes(num_bytes)}")
+    require_memory(num_bytes, "an update", "give a smaller ppo.num_envs or ppo.rollout, or more ppo.minibatches")
 
 
 def mark_undefined_means(metrics: SeedMetrics) -> SeedMetrics:

@@ -20,6 +20,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from jaxnav.env.objectnav import EnvParams
+from jaxnav.numerics.trees import abstract_bytes
 from jaxnav.policies.method import Knowledge, Stage
 from jaxnav.training.devices import replicate_on_devices, replicated_sharding, state_sharding
 from jaxnav.training.ppo import Learner, LearnerState, PPOScalars
@@ -148,6 +149,22 @@ class Trainer:
                 new_states[arm].append(self._keep_best_functions[arm](state, jnp.float32(score)))
         return new_states
 
+    def state_bytes(self, env_params: EnvParams) -> int:
+        """Bytes of the training states of all seeds, without creating them."""
+        # States differ only by arm. Shapes of the last arm, which has the estimator if any has, stand for all.
+        learner = self._stage_learner(list(self.learners)[-1], 0)
+        scalars = self._policy_scalars(0, 0)
+        state = jax.eval_shape(learner.init, self._key, env_params, self._knowledge, scalars.experience_prob)
+        return len(self.learners) * len(self._seeds) * abstract_bytes(state)
+
+    def temporary_bytes(self, stage_index: int) -> int:
+        """Bytes of the temporary arrays of a stage's compiled programs, as many as run at once."""
+        program_bytes = []
+        for arm in self.learners:
+            statistics = self._compiled[arm, stage_index].memory_analysis()
+            program_bytes.append(0 if statistics is None else statistics.temp_size_in_bytes)
+        return self._num_programs * max(program_bytes)
+
     def is_compiled(self, stage_index: int) -> bool:
         """True if the updates of every arm in a stage are compiled."""
         return all((arm, stage_index) in self._compiled for arm in self.learners)
@@ -186,7 +203,7 @@ class Trainer:
 
         # Seeds of all arms run in threads, as many as there are cores.
         jobs = [(arm, policy_index) for policy_index in range(len(self._seeds)) for arm in self.learners]
-        with ThreadPoolExecutor(min(len(jobs), os.cpu_count() or 1)) as pool:
+        with ThreadPoolExecutor(self._num_programs) as pool:
             results = list(pool.map(train_seed, jobs))
 
         # Results by arm, in the order of the seeds.
@@ -196,6 +213,11 @@ class Trainer:
             new_states[arm].append(state)
             metrics[arm].append({name: float(value) for name, value in values.items()})
         return new_states, metrics
+
+    @property
+    def _num_programs(self) -> int:
+        """Number of programs that run at once in the same memory: one for each policy, as far as there are cores."""
+        return min(len(self.learners) * len(self._seeds), os.cpu_count() or 1)
 
     def _policy_scalars(self, stage_index: int, policy_index: int) -> PPOScalars:
         """Traced settings of a policy in a stage."""
@@ -274,6 +296,10 @@ class ShardedTrainer(Trainer):
 
         return jax.tree.map(add_shardings, abstract_states, is_leaf=lambda node: isinstance(node, LearnerState))
 
+    def state_bytes(self, env_params: EnvParams) -> int:
+        """Bytes of the training states in the memory of a device; simulated devices of a CPU share one memory."""
+        return self._num_programs * super().state_bytes(env_params) // self._mesh.size
+
     def pack(self, seed_states: SeedStates) -> TrainerStates:
         """Stack the states of each arm's seeds, and divide them among groups of devices."""
         return {arm: self._stack(arm_states) for arm, arm_states in seed_states.items()}
@@ -335,6 +361,11 @@ class ShardedTrainer(Trainer):
     def compile(self, arm: str, states: TrainerStates, env_params: EnvParams, stage_index: int = 0) -> None:
         """Compile a chunk of updates of an arm in a stage; see `Trainer.compile`."""
         super().compile(arm, states, self._replicate_env_params(env_params), stage_index)
+
+    @property
+    def _num_programs(self) -> int:
+        """Number of devices of this process that share one memory."""
+        return jax.local_device_count() if jax.default_backend() == "cpu" else 1
 
     def _state_argument(self, arm_states: Any) -> LearnerState:
         return arm_states
