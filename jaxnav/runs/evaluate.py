@@ -7,7 +7,6 @@ compares results with those of layout-blind agents, and `replay_episodes` plays 
 """
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -189,13 +188,9 @@ def evaluate(
     # Run all rows, and the oracle on the same episodes. The oracle reads the tables of every bank once more.
     compiled = compiled or compile_evaluation_world(config, split, scenes, shift, console, world, shift_by)
     applied_shift = evaluation_shift(config, scenes or world, shift)
-    with show_activity(console, _describe_evaluation(episodes, applied_shift)), ThreadPoolExecutor(1) as thread:
-        # Decision shares are counted in a thread: compilations use one core each.
-        episode_lists = draw_episode_lists(compiled, episodes, seed)
-        share_rows = rows_with_shares(rows)
-        counting = thread.submit(count_shares, share_rows, policies, compiled, episode_lists, seed)
-
+    with show_activity(console, _describe_evaluation(episodes, applied_shift)):
         # Replacements are further rows of the same grid.
+        episode_lists = draw_episode_lists(compiled, episodes, seed)
         replacements = list_cost_replacements(rows, costs)
         max_room_episodes = limit_room_episodes(episode_lists, costs)
         outcome, replaced_outcome, compilations = _evaluate_with_replacements(
@@ -203,7 +198,10 @@ def evaluate(
         )
         env_params = prefetch_env_params(compiled, range(len(compiled.banks)))
         oracle_outcome = run_oracle(compiled.banks, episode_lists, env_params, compiled.env)
-        share_counts, probed_episodes = counting.result()
+
+        # Decision shares come last: two compilations at once need twice the memory, and are hardly faster.
+        share_rows = rows_with_shares(rows)
+        share_counts, probed_episodes = count_shares(share_rows, policies, compiled, episode_lists, seed)
     costs_by_replacement = measure_costs(
         rows, outcome, replacements, replaced_outcome, episode_lists, max_room_episodes
     )
