@@ -1,13 +1,17 @@
 """One run in several processes is the run of one, and ends when one of them is lost."""
 
+import os
 import re
 import shutil
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import chex
 import pytest
 from support.commands import evaluate, train
-from support.processes import ends, free_address, start
+from support.processes import REPOSITORY, ends, free_address, start
 from support.tiny_run import write_config
 
 from jaxnav.store.export import load_params
@@ -46,6 +50,37 @@ def test_two_processes_train_the_run_of_one(tmp_path, capsys):
     assert "resumed after update 2 of 4" in capsys.readouterr().err
     assert_same_run(one, two)
     assert evaluate(two, "--episodes", 10) == 0
+
+
+#: Stands for Slurm's `srun`: starts two tasks on this machine, with the variables that Slurm gives to each.
+SRUN = """#!/bin/bash
+for task in 0 1; do
+  SLURM_JOB_ID={job} SLURM_STEP_NODELIST=localhost SLURM_NTASKS=2 SLURM_PROCID=$task SLURM_LOCALID=$task "$@" &
+  tasks+=($!)
+done
+wait "${{tasks[0]}}" && wait "${{tasks[1]}}"
+"""
+
+
+@pytest.mark.slow
+def test_slurm_script_trains_one_run_on_two_hosts(tmp_path):
+    """Only `srun` is replaced: the script, and how JAX finds the processes of a job, are those of a cluster."""
+    srun = tmp_path / "srun"
+    srun.write_text(SRUN.format(job=os.getpid()))
+    srun.chmod(0o755)
+    config_file, one, two = write_config(tmp_path), tmp_path / "one", tmp_path / "two"
+    assert train(config_file, one) == 0
+
+    environment = os.environ | {
+        "PATH": f"{tmp_path}:{os.environ['PATH']}",
+        "JAXNAV": str(Path(sys.executable).with_name("jaxnav")),
+        "XLA_FLAGS": "",
+    }
+    script = [REPOSITORY / "configs" / "slurm.sh", "--config", config_file, "--run-dir", two]
+    completed = subprocess.run(script, env=environment, cwd=REPOSITORY, capture_output=True, text=True, timeout=600)
+    assert completed.returncode == 0, completed.stderr
+    assert completed.stderr.count("done in") == 1
+    assert_same_run(one, two)
 
 
 @pytest.mark.exhaustive
