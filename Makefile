@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 # Benchmarks whose report is stored in results/performance, for docs/performance.md and docs/scaling.md.
-BENCHMARKS := compile_time compiling environment estimator growth inference methods peers scaling seeds streaming sweep \
+BENCHMARKS := compile_time compiling environment episodes estimator growth inference methods peers scaling seeds streaming sweep \
   training training_peers utilisation
 # Benchmarks of an accelerator, and the folder of their reports.
 GPU_BENCHMARKS := environment training methods estimator episodes

@@ -67,7 +67,8 @@ def measure_point(num_envs: int) -> dict:
     return {
         "steps_per_s": rate,
         "steps": total_steps,
-        "success": {decoding: summarize(values, digits=3) for decoding, values in success.items()},
+        "success_argmax": summarize(success["argmax"], digits=3),
+        "success_sample": summarize(success["sample"], digits=3),
         "peak_resident_gb": peak_resident_gb(),
         "peak_device_gb": peak_device_gb(),
     }
