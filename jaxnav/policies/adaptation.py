@@ -271,10 +271,11 @@ def replay_window(
 
     changes = {layer: functools.partial(change_output, layer) for layer in ("input_gates", "actor")}
 
-    # Gates of all decisions at once, [..., W, 3 H]; the rectifier of a change of 0 passes on where `fused` is positive.
-    input_gates = Stream.input_gates(policy, window.fused[..., :-1] + output_changes["fuse"], changes)
+    # Input gates of all decisions at once, [..., W, 3 H]. The methods of `Stream` are those of the direct stream.
+    fused = window.fused[..., :-1] + output_changes["fuse"]
+    input_gates = Stream.input_gates(policy, fused, changes)
 
-    # The recurrent core, decision by decision.
+    # Recurrent core, decision by decision.
     def step_core(hidden: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, Any]:
         input_gates, output_change = inputs
         change = layer_changes["hidden_gates"](hidden[..., None, :])[..., 0, :]
@@ -285,7 +286,8 @@ def replay_window(
     time_first = functools.partial(jnp.moveaxis, source=-2, destination=0)
     core_inputs = time_first(input_gates), time_first(output_changes["hidden_gates"])
     _, hidden_states = jax.lax.scan(step_core, window.start, core_inputs, unroll=WINDOW)
-    layer_inputs["hidden_gates"], hidden = (jnp.moveaxis(states, 0, -2) for states in hidden_states)
+    hidden_before, hidden = jax.tree.map(lambda states: jnp.moveaxis(states, 0, -2), hidden_states)
+    layer_inputs["hidden_gates"] = hidden_before
 
     # Action probabilities of all decisions at once.
     logits = policy.action_logits(hidden, window.done_gate, changes)

@@ -15,7 +15,7 @@ from jaxnav.errors import InputError
 from jaxnav.runs.config import RunConfig, check_config
 from jaxnav.runs.config_files import CONFIGS, apply_yaml
 
-PRESETS = ["belief", "long", "paper", "paper_small", "paper_vtnet", "small_goals", "smoke"]
+PRESETS = ["belief", "long", "paper", "paper_small", "paper_vtnet", "small_goals", "smoke", "wide"]
 
 
 @pytest.mark.parametrize("option", ["--sizes.relation-layers", "--sizes.relation_layers"])
