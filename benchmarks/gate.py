@@ -98,20 +98,23 @@ def run_measured(checkout: Path, folder: Path, arguments: list[str]) -> tuple[fl
     """Run Python on the package of a checkout; wall seconds and peak memory in GB."""
     environment = os.environ | {"PYTHONPATH": str(checkout), "JAX_COMPILATION_CACHE_DIR": str(folder / "programs")}
     start_time = time.perf_counter()
-    process = subprocess.Popen(
-        [sys.executable, *arguments], cwd=folder, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-    _, status, usage = os.wait4(process.pid, 0)
-    if status:
-        raise RuntimeError(f"{checkout}: python {' '.join(arguments)} failed")
-    return time.perf_counter() - start_time, usage.ru_maxrss / 2**20
+    with tempfile.TemporaryFile("w+") as messages:
+        process = subprocess.Popen(
+            [sys.executable, *arguments], cwd=folder, env=environment, stdout=subprocess.DEVNULL, stderr=messages
+        )
+        _, status, usage = os.wait4(process.pid, 0)
+        seconds = time.perf_counter() - start_time
+        if status:
+            messages.seek(0)
+            raise RuntimeError(f"{checkout}: python {' '.join(arguments)} failed:\n{messages.read()}")
+    return seconds, usage.ru_maxrss / 2**20
 
 
 def run_benchmark(checkout: Path, file_name: str) -> dict:
     """Run a benchmark of a checkout, and return its report."""
     environment = os.environ | {"PYTHONPATH": str(checkout)}
     command = [sys.executable, checkout / "benchmarks" / file_name]
-    output = subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout
+    output = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True).stdout
     return json.loads(output)
 
 
