@@ -73,7 +73,7 @@ class LowRankChange(NamedTuple):
     """Change of a layer's kernel and bias, as a product of rank R.
 
     Attributes:
-      inputs: float32 [..., R, M], inputs of the layer, with a 1 for its bias.
+      inputs: float32 [..., R, M], inputs of the layer, with a 1 appended where the layer has a bias.
       outputs: float32 [..., R, N], change of the output per unit of similarity to each input.
     """
 
@@ -87,18 +87,16 @@ class LowRankChange(NamedTuple):
 
 
 class Window(NamedTuple):
-    """The last decisions of an episode, from which the next inner step learns; the latest is at the end.
+    """The last `WINDOW` decisions of an episode, from which the next inner step learns; the latest is at the end.
 
     Attributes:
-      start: float32 [..., H], hidden state before the first decision.
+      start: float32 [..., H], hidden state before the first decision since the last inner step.
       fuse_inputs: float32 [..., W, M], inputs of the fusing layer, with a 1 for its bias.
-      fused: float32 [..., W, H + 1], rectified outputs of the fusing layer, with a 1 for the bias of the next layer.
       done_gate: float32 [..., W, 1], gates of Done's logit.
     """
 
     start: jax.Array
     fuse_inputs: jax.Array
-    fused: jax.Array
     done_gate: jax.Array
 
 
@@ -159,7 +157,6 @@ class LearnedLossAdaptation:
         window = Window(
             start=jnp.zeros((*batch, policy.hidden)),
             fuse_inputs=jnp.zeros((*batch, WINDOW, policy.layer_widths["fuse"][0])),
-            fused=jnp.zeros((*batch, WINDOW, policy.hidden + 1)),
             done_gate=jnp.zeros((*batch, WINDOW, 1)),
         )
         return FastWeights(jnp.zeros(batch, jnp.int32), window, layer_changes)
@@ -252,7 +249,7 @@ def replay_window(
     layer_changes: dict[str, LowRankChange],
     output_changes: dict[str, jax.Array],
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Repeat the decisions of a window from the outputs of the fusing layer; with streams, those of the direct stream.
+    """Repeat the decisions of a full window; with streams, those of the direct stream alone.
 
     Args:
       policy: the policy that decided.
@@ -263,7 +260,7 @@ def replay_window(
     Returns:
       Rows float32 [..., W, H + A] of hidden state and action probabilities, and the inputs [..., W, M] of each layer.
     """
-    layer_inputs = {"fuse": window.fuse_inputs}
+    layer_inputs: dict[str, jax.Array] = {}
 
     def change_output(layer: str, inputs: jax.Array) -> jax.Array:
         layer_inputs[layer] = inputs
@@ -271,8 +268,9 @@ def replay_window(
 
     changes = {layer: functools.partial(change_output, layer) for layer in ("input_gates", "actor")}
 
-    # Input gates of all decisions at once, [..., W, 3 H]. The methods of `Stream` are those of the direct stream.
-    fused = window.fused[..., :-1] + output_changes["fuse"]
+    # Fusing layer and input gates of all decisions at once, [..., W, 3 H]. `StreamsPolicy` overrides the methods of
+    # `Stream` for both streams, so the direct stream's own are called by the class.
+    fused = policy.fuse(window.fuse_inputs[..., :-1]) + change_output("fuse", window.fuse_inputs)
     input_gates = Stream.input_gates(policy, fused, changes)
 
     # Recurrent core, decision by decision.
@@ -305,7 +303,6 @@ def _append_decision(fast: FastWeights, layer_inputs: dict[str, jax.Array], done
     window = Window(
         start=jnp.where(is_first, layer_inputs["hidden_gates"], fast.window.start),
         fuse_inputs=shift_in(fast.window.fuse_inputs, layer_inputs["fuse"]),
-        fused=shift_in(fast.window.fused, layer_inputs["input_gates"]),
         done_gate=shift_in(fast.window.done_gate, done_gate),
     )
     return fast._replace(num_decisions=fast.num_decisions + 1, window=window)
