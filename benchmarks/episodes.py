@@ -40,7 +40,7 @@ def main() -> None:
 
 def measure_point(num_envs: int) -> dict:
     """Return speed, success after `SECONDS` and peak memory with so many parallel episodes."""
-    # Chunks of about as many steps, so that logs and checkpoints weigh alike.
+    # Chunks have about as many steps up to 1,024 episodes, so that logs and checkpoints weigh alike.
     config = RunConfig(seeds=1, arms=(ARM,), chunk=max(1, CHUNK_EPISODES // num_envs), validations=1, val_episodes=1000)
     ppo = dataclasses.replace(config.ppo, num_envs=num_envs, minibatches=num_envs // MINIBATCH_EPISODES)
     config = dataclasses.replace(config, ppo=ppo)
@@ -56,6 +56,7 @@ def measure_point(num_envs: int) -> dict:
     # Runs of equal time.
     total_steps = round(rate["median"] * SECONDS)
     success = {"argmax": [], "sample": []}
+    last_row = {}
     for seed in range(NUM_SEEDS):
         with tempfile.TemporaryDirectory() as folder:
             run_config = dataclasses.replace(config, seed=seed, total_steps=total_steps, run_dir=Path(folder) / "run")
@@ -66,7 +67,7 @@ def measure_point(num_envs: int) -> dict:
             success["sample"].append(100 * last_row["val_success_sampled"])
     return {
         "steps_per_s": rate,
-        "steps": total_steps,
+        "steps": last_row["env_steps"],
         "success_argmax": summarize(success["argmax"], digits=3),
         "success_sample": summarize(success["sample"], digits=3),
         "peak_resident_gb": peak_resident_gb(),

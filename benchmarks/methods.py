@@ -1,6 +1,6 @@
 """Training speed and size of each method.
 
-`python benchmarks/methods.py [METHOD ...]` times one update of every stage of the methods (all of this package's unless
+`python benchmarks/methods.py [METHOD ...]` times one update of every stage of the methods (all that PPO trains unless
 some are named) in turns with ORG's: environment steps per second, learning included, on the default networks, rooms and
 arm `baseline`. The report adds the numbers of parameters of the policy and of its method alone, and the lines of the
 files that define its experience, tracker, knowledge, adaptation and control.
@@ -29,7 +29,8 @@ def main(names: list[str]) -> None:
     # Compile one update of every stage; the last stage goes by the method's name.
     calls = {}
     sizes = {}
-    for name in dict.fromkeys([REFERENCE, *(names or METHODS)]):
+    trained_methods = [name for name, method in METHODS.items() if method.fit is None]
+    for name in dict.fromkeys([REFERENCE, *(names or trained_methods)]):
         config = RunConfig(method=name, arms=("baseline",), seeds=1, worlds=WorldConfig(num_train=16))
         setup = set_up_training(config, explore=False)
         learner = setup.trainer.learners["baseline"]

@@ -1,8 +1,9 @@
 #!/bin/bash
-# One training run on several hosts of a Slurm cluster, one process per host:
+# One training run on several hosts of a Slurm cluster, one process per host. Submit it from the repository, or set
+# JAXNAV to the path of the command:
 #     sbatch --nodes 4 configs/slurm.sh --world houses --seeds 4 --run-dir runs/houses
 # The options are those of `jaxnav train`. Give as many seeds as hosts, or a multiple: seeds divide without loss.
-# Preempted jobs restart by themselves; after the time limit, submit the same command again. Both resume the run.
+# Submit the same command again after the time limit; the run resumes, also where Slurm requeues a preempted job.
 #SBATCH --job-name=jaxnav
 #SBATCH --nodes=2
 #SBATCH --ntasks-per-node=1
@@ -11,6 +12,8 @@
 #SBATCH --requeue
 #SBATCH --open-mode=append
 #SBATCH --signal=TERM@120
-# On hosts with GPUs, one process per GPU: --ntasks-per-node=4 --gpus-per-task=1
+# JAX uses one GPU per process. With four GPUs per host: --ntasks-per-node=4 --gpus-per-node=4 --gpu-bind=none
 set -euo pipefail
+# srun does not take over this option of sbatch.
+export SRUN_CPUS_PER_TASK="${SLURM_CPUS_PER_TASK:-1}"
 exec srun "${JAXNAV:-.venv/bin/jaxnav}" train --devices cluster "$@"

@@ -24,8 +24,8 @@ Function = Callable[[Any, Any, Any], Any]
 def update_where(mask: jax.Array, function: Function, shared: Any, inputs: Any, state: Any) -> Any:
     """Update the state of the batch members where `mask` is True.
 
-    Members to update are sorted first, and parts of the batch without any are skipped. Other members are neither read
-    nor written, also in reverse mode, so the cost grows with the number of updates.
+    Members to update are sorted first and computed in up to eight equal parts, also in reverse mode; parts without any
+    such member are skipped, so the cost grows with the number of updates. A batch of odd size is one part.
 
     Args:
       mask: bool [...].

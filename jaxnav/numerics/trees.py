@@ -33,7 +33,7 @@ def take_rows(tree: Tree, row_indices: jax.Array) -> Tree:
     return jax.tree.map(lambda leaf: leaf[row_indices], tree)
 
 
-def abstract_bytes(tree: Any) -> int:
+def count_array_bytes(tree: Any) -> int:
     """Return the bytes of a tree of arrays, or of their shapes from `jax.eval_shape`."""
     plain_tree = jax.eval_shape(functools.partial(jax.tree.map, _as_plain_array), tree)
     return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(plain_tree))

@@ -199,7 +199,7 @@ def evaluate(
         env_params = prefetch_env_params(compiled, range(len(compiled.banks)))
         oracle_outcome = run_oracle(compiled.banks, episode_lists, env_params, compiled.env)
 
-        # Decision shares come last: two compilations at once need twice the memory, and are hardly faster.
+        # Decision shares come last: two compilations at once raise the peak of memory, and save three seconds at most.
         share_rows = rows_with_shares(rows)
         share_counts, probed_episodes = count_shares(share_rows, policies, compiled, episode_lists, seed)
     costs_by_replacement = measure_costs(

@@ -595,6 +595,11 @@ def _restore_or_init(
     Checkpoints and log rows after the restored update are moved away or dropped, because training will write them
     again.
     """
+    state_bytes = trainer.estimate_state_bytes(env_params)
+    require_memory(
+        state_bytes, "the state of training", "give fewer seeds or a smaller ppo.num_envs in a new --run-dir"
+    )
+
     checkpoint = None
     if has_checkpoints(config.run_dir):
         checkpoint = restore_checkpoint(config.run_dir, trainer.abstract_states(env_params), manifest)
@@ -606,9 +611,6 @@ def _restore_or_init(
     run_on_first_process(lambda: set_aside_checkpoints_after(config.run_dir, update))
     run_on_first_process(lambda: RunLogs(config).rewind(update))
 
-    require_memory(
-        trainer.state_bytes(env_params), "the state of training", "give fewer seeds or a smaller ppo.num_envs"
-    )
     if checkpoint is None:
         return trainer.init(env_params), 0
     console.print(f"resumed after update {update} of {config.total_updates}")
@@ -732,7 +734,7 @@ def _compile_training(
     """Compile the updates of every arm in a stage, and say how long it took and how much memory they need.
 
     Raises:
-      InputError: less memory is free.
+      InputError: the first stage needs more memory than is free.
     """
     arm_times = []
     for arm in session.trainer.learners:
@@ -740,9 +742,13 @@ def _compile_training(
         start = time.monotonic()
         session.trainer.compile(arm, states, env_params, stage_index)
         arm_times.append(f"{arm} {time.monotonic() - start:.1f} s")
-    num_bytes = session.trainer.temporary_bytes(stage_index)
-    session.console.print(f"compiled the training: {', '.join(arm_times)}; an update needs {format_bytes(num_bytes)}")
-    require_memory(num_bytes, "an update", "give a smaller ppo.num_envs or ppo.rollout, or more ppo.minibatches")
+    num_bytes = session.trainer.estimate_temporary_bytes(stage_index)
+    session.console.print(f"compiled the training: {', '.join(arm_times)}; updates need {format_bytes(num_bytes)}")
+
+    # Later stages try in any case, because a refusal would lose the updates since the last checkpoint.
+    if stage_index == 0:
+        remedy = "give fewer seeds, a smaller ppo.num_envs or ppo.rollout, or more ppo.minibatches in a new --run-dir"
+        require_memory(num_bytes, "an update", remedy)
 
 
 def mark_undefined_means(metrics: SeedMetrics) -> SeedMetrics:

@@ -20,7 +20,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from jaxnav.env.objectnav import EnvParams
-from jaxnav.numerics.trees import abstract_bytes
+from jaxnav.numerics.trees import count_array_bytes
 from jaxnav.policies.method import Knowledge, Stage
 from jaxnav.training.devices import replicate_on_devices, replicated_sharding, state_sharding
 from jaxnav.training.ppo import Learner, LearnerState, PPOScalars
@@ -149,21 +149,23 @@ class Trainer:
                 new_states[arm].append(self._keep_best_functions[arm](state, jnp.float32(score)))
         return new_states
 
-    def state_bytes(self, env_params: EnvParams) -> int:
+    def estimate_state_bytes(self, env_params: EnvParams) -> int:
         """Bytes of the training states of all seeds, without creating them."""
-        # States differ only by arm. Shapes of the last arm, which has the estimator if any has, stand for all.
-        learner = self._stage_learner(list(self.learners)[-1], 0)
-        scalars = self._policy_scalars(0, 0)
-        state = jax.eval_shape(learner.init, self._key, env_params, self._knowledge, scalars.experience_prob)
-        return len(self.learners) * len(self._seeds) * abstract_bytes(state)
+        num_bytes = 0
+        for arm in self.learners:
+            scalars = self._policy_scalars(0, 0)
+            init = self._stage_learner(arm, 0).init
+            state = jax.eval_shape(init, self._key, env_params, self._knowledge, scalars.experience_prob)
+            num_bytes += len(self._seeds) * count_array_bytes(state)
+        return num_bytes
 
-    def temporary_bytes(self, stage_index: int) -> int:
-        """Bytes of the temporary arrays of a stage's compiled programs, as many as run at once."""
+    def estimate_temporary_bytes(self, stage_index: int) -> int:
+        """Bytes of the temporary arrays of a stage's compiled programs, as many as run at once in one memory."""
         program_bytes = []
         for arm in self.learners:
             statistics = self._compiled[arm, stage_index].memory_analysis()
             program_bytes.append(0 if statistics is None else statistics.temp_size_in_bytes)
-        return self._num_programs * max(program_bytes)
+        return self._num_programs_in_memory * max(program_bytes)
 
     def is_compiled(self, stage_index: int) -> bool:
         """True if the updates of every arm in a stage are compiled."""
@@ -203,7 +205,7 @@ class Trainer:
 
         # Seeds of all arms run in threads, as many as there are cores.
         jobs = [(arm, policy_index) for policy_index in range(len(self._seeds)) for arm in self.learners]
-        with ThreadPoolExecutor(self._num_programs) as pool:
+        with ThreadPoolExecutor(self._num_threads) as pool:
             results = list(pool.map(train_seed, jobs))
 
         # Results by arm, in the order of the seeds.
@@ -215,9 +217,14 @@ class Trainer:
         return new_states, metrics
 
     @property
-    def _num_programs(self) -> int:
-        """Number of programs that run at once in the same memory: one for each policy, as far as there are cores."""
+    def _num_threads(self) -> int:
+        """Number of policies that train at once, one for each core."""
         return min(len(self.learners) * len(self._seeds), os.cpu_count() or 1)
+
+    @property
+    def _num_programs_in_memory(self) -> int:
+        """Number of programs whose arrays share one memory; an accelerator runs one program after another."""
+        return self._num_threads if jax.default_backend() == "cpu" else 1
 
     def _policy_scalars(self, stage_index: int, policy_index: int) -> PPOScalars:
         """Traced settings of a policy in a stage."""
@@ -296,9 +303,9 @@ class ShardedTrainer(Trainer):
 
         return jax.tree.map(add_shardings, abstract_states, is_leaf=lambda node: isinstance(node, LearnerState))
 
-    def state_bytes(self, env_params: EnvParams) -> int:
-        """Bytes of the training states in the memory of a device; simulated devices of a CPU share one memory."""
-        return self._num_programs * super().state_bytes(env_params) // self._mesh.size
+    def estimate_state_bytes(self, env_params: EnvParams) -> int:
+        """Bytes of the training states in the memory of a device; episodes, most of them, are divided."""
+        return self._num_programs_in_memory * super().estimate_state_bytes(env_params) // self._mesh.size
 
     def pack(self, seed_states: SeedStates) -> TrainerStates:
         """Stack the states of each arm's seeds, and divide them among groups of devices."""
@@ -363,9 +370,9 @@ class ShardedTrainer(Trainer):
         super().compile(arm, states, self._replicate_env_params(env_params), stage_index)
 
     @property
-    def _num_programs(self) -> int:
-        """Number of devices of this process that share one memory."""
-        return jax.local_device_count() if jax.default_backend() == "cpu" else 1
+    def _num_programs_in_memory(self) -> int:
+        """Number of devices of the mesh that share one memory: those of this process, where they are parts of a CPU."""
+        return self._mesh.local_mesh.size if jax.default_backend() == "cpu" else 1
 
     def _state_argument(self, arm_states: Any) -> LearnerState:
         return arm_states

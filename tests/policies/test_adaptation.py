@@ -51,8 +51,11 @@ def random_episode(seed, *batch_shape):
     return Observation(jnp.asarray(row), jnp.asarray(goal)), jnp.asarray(action, jnp.int32)
 
 
-def run_package(spec, weights, adaptation, observation, action):
-    """Logits and fast weights of the package along given actions, leaves [27, *batch_shape, ...]."""
+def run_package(spec, weights, adaptation, observation, action, cut=0):
+    """Logits and fast weights of the package along given actions, leaves [27, *batch_shape, ...].
+
+    Gradients only reach the decisions from `cut` on, as in a rollout that begins there.
+    """
     policy = bind(spec, weights)
     policy.adaptation = adaptation
     batch_shape = action.shape[1:]
@@ -66,22 +69,30 @@ def run_package(spec, weights, adaptation, observation, action):
 
     use_experience = None if spec.decision == "fused" else jnp.ones(batch_shape)
     memory = policy.initial_memory(batch_shape)._replace(use_experience=use_experience)
-    _, (logits, fast) = jax.lax.scan(step, memory, (observation, action))
-    return logits, fast
+    before, after = (tiny.leaves_at((observation, action), part) for part in (slice(cut), slice(cut, None)))
+    memory, earlier_outputs = jax.lax.stop_gradient(jax.lax.scan(step, memory, before))
+    _, outputs = jax.lax.scan(step, memory, after)
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts), earlier_outputs, outputs)
 
 
-def run_reference(spec, weights, observation, action, order=2):
+def run_reference(spec, weights, observation, action, order=2, cut=0):
     """Logits [27, A] of one episode whose kernels take the steps themselves: the rule as SAVN's code has it.
 
     After each window the gradient of the learned loss by the kernels and biases that act is taken with the hidden
     state before the window and experience as they were. With `order` 1 it is no function of anything but the loss's
-    parameters, with `order` 0 it is a constant.
+    parameters, with `order` 0 it is a constant. What was stored before `cut` is a constant, too: the changes of the
+    kernels, the memory and the inputs of the window.
     """
     fast_weights = weights
     memory = bind(spec, weights).initial_memory()
     window = []
     logits = []
-    for time in range(NUM_STEPS):
+    for time in range(len(action)):
+        if time == cut:
+            change = jax.tree.map(jnp.subtract, fast_weights, weights)
+            fast_weights = jax.tree.map(jnp.add, weights, jax.lax.stop_gradient(change))
+            memory, window, logits = jax.lax.stop_gradient((memory, window, logits))
+
         # Act with the present kernels.
         policy = bind(spec, fast_weights)
         step_observation = tiny.leaves_at(observation, time)
@@ -186,6 +197,30 @@ def test_training_gradient_of_adaptation_has_the_configured_order(order):
     assert np.abs(other_gradient["fuse"]["kernel"] - gradient["fuse"]["kernel"]).max() > 1e-3 * scale
     for leaf in jax.tree.leaves(reference_gradient(weights, 0)["method"]):
         assert not np.asarray(leaf).any()
+
+
+@pytest.mark.slow
+def test_training_gradient_from_the_middle_of_a_window_reaches_its_stored_inputs():
+    """The rollout begins after nine decisions, the fourth of the second window, and ends after its inner step."""
+    observation, action = tiny.leaves_at(random_episode(7), slice(15))
+    weights = tiny.random_params(0, SAVN)
+    adaptation = LearnedLossAdaptation(learning_rate=LEARNING_RATE)
+    logit_weights = jnp.asarray(np.random.default_rng(2).normal(size=(15, NUM_ACTIONS)), jnp.float32)
+
+    def package_loss(weights, cut):
+        return (logit_weights * run_package(SAVN, weights, adaptation, observation, action, cut)[0]).sum()
+
+    def reference_loss(weights, cut):
+        return (logit_weights * run_reference(SAVN, weights, observation, action, cut=cut)).sum()
+
+    gradient = jax.jit(jax.grad(package_loss), static_argnums=1)(weights, 9)
+    expected = jax.jit(jax.grad(reference_loss), static_argnums=1)(weights, 9)
+    scale = max(float(np.abs(leaf).max()) for leaf in jax.tree.leaves(gradient))
+    chex.assert_trees_all_close(gradient, expected, rtol=2e-3, atol=1e-4 * scale)
+
+    # Negative control: a cut elsewhere gives another gradient.
+    other_gradient = jax.jit(jax.grad(package_loss), static_argnums=1)(weights, 6)
+    assert np.abs(other_gradient["fuse"]["kernel"] - gradient["fuse"]["kernel"]).max() > 1e-3 * scale
 
 
 def test_learned_loss_is_the_norm_of_two_causal_convolutions():

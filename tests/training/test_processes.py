@@ -54,6 +54,7 @@ def test_two_processes_train_the_run_of_one(tmp_path, capsys):
 
 #: Stands for Slurm's `srun`: starts two tasks on this machine, with the variables that Slurm gives to each.
 SRUN = """#!/bin/bash
+trap 'kill "${{tasks[@]}}" 2> /dev/null' EXIT
 for task in 0 1; do
   SLURM_JOB_ID={job} SLURM_STEP_NODELIST=localhost SLURM_NTASKS=2 SLURM_PROCID=$task SLURM_LOCALID=$task "$@" &
   tasks+=($!)
