@@ -13,7 +13,7 @@ VERSION = $(shell sed -n 's/^version = "\(.*\)"$$/\1/p' pyproject.toml)
 # Version of the topmost section of the changelog.
 CHANGES = $(shell sed -n 's/^\#\# \[\([^]]*\)\].*/\1/p' CHANGELOG.md | head -n 1)
 
-.PHONY: help setup run test lint docs test-slow test-exhaustive coverage mutants gate versions bench bench-gpu package release lock clean
+.PHONY: help setup run test lint docs test-slow test-exhaustive coverage mutants gate regression versions bench bench-gpu package release lock clean
 
 help:
 	@echo 'make run        train on generated rooms, then evaluate the run (runs/rooms)'
@@ -23,6 +23,7 @@ help:
 	@echo 'make coverage   the fast tests, with the branch coverage of the package'
 	@echo 'make mutants    change the code in many ways, and list the changes that no test detects'
 	@echo 'make gate       fail if commands, training or environment are slower than at a stored commit, or need more memory'
+	@echo 'make regression  train every method for a short time, and fail where success leaves its stored band'
 	@echo 'make versions   the fast tests on every Python, with the oldest and the newest packages'
 	@echo 'make docs       build the documentation, site/index.html'
 	@echo 'make bench      run every benchmark, and update results/performance and the tables of the documentation'
@@ -77,6 +78,12 @@ COMMIT :=
 
 gate: $(READY)
 	$(BIN)/python benchmarks/gate.py $(COMMIT)
+
+# METHODS are all unless some are named.
+METHODS :=
+
+regression: $(READY)
+	$(BIN)/python benchmarks/regression.py $(METHODS)
 
 # Needs uv, which downloads each Python.
 PYTHONS := 3.11 3.12 3.13

@@ -1,0 +1,54 @@
+"""Bands of the regression check: worked arithmetic, and runs inside and outside."""
+
+import importlib
+import json
+from pathlib import Path
+
+import pytest
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+
+
+@pytest.fixture
+def regression(tmp_path, monkeypatch):
+    """The module, with an empty file of bands."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    module = importlib.import_module("regression")
+    monkeypatch.setattr(module, "BANDS_FILE", tmp_path / "regression.json")
+    return module
+
+
+def use_runs(monkeypatch, regression, successes, options=()):
+    """Give each seed a success in place of training, and the command its options."""
+    monkeypatch.setattr(regression, "measure_success", lambda name, seed: successes[seed])
+    monkeypatch.setattr("sys.argv", ["regression.py", *options])
+
+
+def test_band_is_the_prediction_interval_of_two_further_runs(regression):
+    # Mean 84, standard deviation sqrt(10), t(99.5 %, 4) = 4.6041: 4.6041 * 3.1623 * sqrt(1/5 + 1/2) = 12.18.
+    assert regression.compute_band([80, 82, 84, 86, 88]) == pytest.approx([71.82, 96.18], abs=0.01)
+    # Never below 0 or above 100.
+    assert regression.compute_band([1, 99, 50, 2, 98]) == [0.0, 100.0]
+
+
+@pytest.mark.parametrize(("checked_success", "expected"), [((83, 73), True), ((73, 70), False), ((97, 99), False)])
+def test_check_passes_within_the_band_alone(regression, monkeypatch, capsys, checked_success, expected):
+    band_runs = dict(enumerate([80, 82, 84, 86, 88]))
+    use_runs(monkeypatch, regression, band_runs, ["--record", "org"])
+    assert regression.main()
+    assert json.loads(regression.BANDS_FILE.read_text())["org"]["success"] == [80, 82, 84, 86, 88]
+
+    use_runs(monkeypatch, regression, dict(zip(regression.CHECK_SEEDS, checked_success, strict=True)), ["org"])
+    assert regression.main() is expected
+    assert ("outside" in capsys.readouterr().out) is not expected
+
+
+def test_recording_keeps_stored_bands_and_a_method_without_one_fails(regression, monkeypatch, capsys):
+    regression.BANDS_FILE.write_text(json.dumps({"org": {"success": [50] * 5, "band": [40, 60]}}))
+    use_runs(monkeypatch, regression, dict.fromkeys(range(7), 90.0), ["--record", "org"])
+    assert regression.main()
+    assert json.loads(regression.BANDS_FILE.read_text())["org"]["band"] == [40, 60]
+
+    use_runs(monkeypatch, regression, dict.fromkeys(range(7), 90.0), ["savn"])
+    assert not regression.main()
+    assert "savn: no band; record one by --record savn" in capsys.readouterr().err
