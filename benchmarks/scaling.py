@@ -85,7 +85,10 @@ def run_pair(role: str, *arguments: str, pinned: bool = False) -> dict:
         processes.append(start_process(command, JAX_COORDINATOR_BIND_ADDRESS=address))
     os.sched_setaffinity(0, all_cores)
     first_output, _ = [process.communicate()[0] for process in processes]
-    return json.loads(first_output.splitlines()[-1])  # gloo prints lines before
+
+    # gloo prints lines of its own, before the report and sometimes after it.
+    reports = [line for line in first_output.splitlines() if line.startswith("{")]
+    return json.loads(reports[-1])
 
 
 def start_process(arguments: list[str], **variables: str) -> subprocess.Popen:
