@@ -98,22 +98,24 @@ versions:
 	  $$venv/bin/python -m pytest -n 2 $(TESTS) || failed="$$failed $$name"; \
 	done; done; test -z "$$failed" || { echo "failed:$$failed" >&2; exit 1; }
 
-# A benchmark that fails keeps its last result, and the other benchmarks still run.
+# Runs the benchmarks $(1) into the folder $(2), then the command $(3). A benchmark that fails keeps its last result,
+# and the other benchmarks still run.
+define run_benchmarks
+@mkdir -p $(2); failed=; for name in $(1); do \
+  echo "== $$name"; result=$(2)/$$name.json; \
+  if $(BIN)/python benchmarks/$$name.py > $$result.new; then mv $$result.new $$result; \
+  else rm -f $$result.new; failed="$$failed $$name"; fi; done; \
+$(3) || exit 1; \
+test -z "$$failed" || { echo "failed:$$failed" >&2; exit 1; }
+endef
+
 bench: $(READY)
-	@failed=; for name in $(BENCHMARKS); do \
-	  echo "== $$name"; result=results/performance/$$name.json; \
-	  if $(BIN)/python benchmarks/$$name.py > $$result.new; then mv $$result.new $$result; \
-	  else rm -f $$result.new; failed="$$failed $$name"; fi; done; \
-	$(BIN)/python benchmarks/table.py && $(BIN)/python benchmarks/simulate.py || exit 1; \
-	test -z "$$failed" || { echo "failed:$$failed" >&2; exit 1; }
+	$(call run_benchmarks,$(BENCHMARKS),results/performance,$(BIN)/python benchmarks/table.py && $(BIN)/python benchmarks/simulate.py)
 
 # Needs JAX for CUDA in .venv, see docs/gpu.md. Without full precision a GPU rounds the factors of matrix products.
+bench-gpu: export JAX_DEFAULT_MATMUL_PRECISION := highest
 bench-gpu: $(READY)
-	@mkdir -p $(GPU_RESULTS); failed=; for name in $(GPU_BENCHMARKS); do \
-	  echo "== $$name"; result=$(GPU_RESULTS)/$$name.json; \
-	  if JAX_DEFAULT_MATMUL_PRECISION=highest $(BIN)/python benchmarks/$$name.py > $$result.new; then \
-	  mv $$result.new $$result; else rm -f $$result.new; failed="$$failed $$name"; fi; done; \
-	test -z "$$failed" || { echo "failed:$$failed" >&2; exit 1; }
+	$(call run_benchmarks,$(GPU_BENCHMARKS),$(GPU_RESULTS),true)
 
 # Builds the source archive, and the wheel from it. The wheel is tried where there are no sources.
 TRIAL := .cache/release

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from _common import print_report
 
@@ -27,7 +26,14 @@ import jaxnav
 from jaxnav.env.objectnav import EnvParams
 from jaxnav.evaluation.statistics import paired_difference
 from jaxnav.plain_console import PlainConsole
-from jaxnav.policies.adaptation import WINDOW, FastWeights, HasLearnedLoss, LearnedLossAdaptation, replay_window
+from jaxnav.policies.adaptation import (
+    WINDOW,
+    FastWeights,
+    HasLearnedLoss,
+    LearnedLossAdaptation,
+    replay_window,
+    zero_output_changes,
+)
 from jaxnav.policies.agent_loop import Agent, AgentLoop, policy_memory
 from jaxnav.policies.method import Knowledge
 from jaxnav.policies.network import Params
@@ -102,10 +108,7 @@ def measure_windows(
     adaptation = cast(LearnedLossAdaptation, policy.adaptation)
 
     def learned_loss(fast: FastWeights) -> jax.Array:
-        zero_changes = {}
-        for layer, factors in fast.layer_changes.items():
-            zero_changes[layer] = jnp.zeros_like(factors.outputs[..., :WINDOW, :])
-        rows, _ = replay_window(policy, fast.window, fast.layer_changes, zero_changes)
+        rows, _ = replay_window(policy, fast.window, fast.layer_changes, zero_output_changes(fast.layer_changes))
         return cast(HasLearnedLoss, policy.method).learned_loss(rows)
 
     def step(agent: Agent, key: jax.Array) -> tuple[Agent, tuple[jax.Array, ...]]:

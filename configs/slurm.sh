@@ -12,7 +12,7 @@
 #SBATCH --requeue
 #SBATCH --open-mode=append
 #SBATCH --signal=TERM@120
-# JAX uses one GPU per process. With four GPUs per host: --ntasks-per-node=4 --gpus-per-node=4 --gpu-bind=none
+# JAX uses one GPU per process. For four GPUs per host, not tried: --ntasks-per-node=4 --gpus-per-node=4 --gpu-bind=none
 set -euo pipefail
 # srun does not take over this option of sbatch.
 export SRUN_CPUS_PER_TASK="${SLURM_CPUS_PER_TASK:-1}"

@@ -214,10 +214,7 @@ class LearnedLossAdaptation:
 
         # The gradient of a kernel is the sum over the window of input (x) gradient by the output, so differentiate by
         # a change of the outputs that is zero.
-        no_changes: dict[str, jax.Array] = {}
-        for layer, change in layer_changes.items():
-            no_changes[layer] = jnp.zeros_like(change.outputs[..., :WINDOW, :])
-        output_gradients, layer_inputs = jax.grad(window_loss, has_aux=True)(no_changes)
+        output_gradients, layer_inputs = jax.grad(window_loss, has_aux=True)(zero_output_changes(layer_changes))
 
         # Descend: inputs and scaled gradients of the outputs are the two factors of the change.
         step_changes: dict[str, LowRankChange] = {}
@@ -241,6 +238,14 @@ def limit_inner_steps(adaptation: "Adaptation | None", inner_steps: int) -> "Ada
         capacity = f"an episode stores {adaptation.inner_steps} windows of {WINDOW} actions"
         raise InputError(f"inner_steps is {inner_steps}, but {capacity}; give 0 to {adaptation.inner_steps}")
     return dataclasses.replace(adaptation, inner_steps=inner_steps)
+
+
+def zero_output_changes(layer_changes: dict[str, LowRankChange]) -> dict[str, jax.Array]:
+    """Return a change of zero for every output of a window, float32 [..., W, N] for each layer."""
+    output_changes: dict[str, jax.Array] = {}
+    for layer, change in layer_changes.items():
+        output_changes[layer] = jnp.zeros_like(change.outputs[..., :WINDOW, :])
+    return output_changes
 
 
 def replay_window(

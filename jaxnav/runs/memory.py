@@ -33,9 +33,9 @@ def read_free_bytes() -> int | None:
         return device_stats["bytes_limit"] - device_stats["bytes_in_use"]
 
     limits = list(_read_free_bytes_of_groups())
-    if _MEMINFO.exists():
-        meminfo = _read_table(_MEMINFO)
-        limits.append(1024 * meminfo["MemAvailable:"])
+    available_kb = _read_table(_MEMINFO).get("MemAvailable:")
+    if available_kb is not None:
+        limits.append(1024 * available_kb)
     return min(limits, default=None)
 
 
@@ -95,11 +95,12 @@ def _read_number(path: Path) -> int | None:
 
 
 def _read_table(path: Path) -> dict[str, int]:
-    """Return the numbers of a file with a name and a number on each line; none without the file."""
+    """Return the numbers of a file with lines of a name and a number; other lines, or a missing file, have none."""
     if not path.exists():
         return {}
     table = {}
     for line in path.read_text().splitlines():
-        name, number, *_ = line.split()
-        table[name] = int(number)
+        words = line.split()
+        if len(words) >= 2 and words[1].isdigit():
+            table[words[0]] = int(words[1])
     return table

@@ -21,6 +21,7 @@ from jaxnav.policies.adaptation import (
     LearnedLossAdaptation,
     limit_inner_steps,
     replay_window,
+    zero_output_changes,
 )
 from jaxnav.policies.methods import METHODS, find_method
 from jaxnav.policies.network import bind
@@ -290,11 +291,8 @@ def test_replay_window_repeats_the_decisions_of_the_window():
 
     # Replay the second window with the changes of the first step and no further ones.
     layer_changes = last_memory.fast.layer_changes
-    no_output_changes = {}
-    for layer_name, factors in layer_changes.items():
-        no_output_changes[layer_name] = jnp.zeros_like(factors.outputs[:WINDOW])
     window = last_decision.fast.window
-    rows, layer_inputs = replay_window(policy, window, layer_changes, no_output_changes)
+    rows, layer_inputs = replay_window(policy, window, layer_changes, zero_output_changes(layer_changes))
 
     last_probs = jax.nn.softmax(last_decision.logits)
     np.testing.assert_allclose(rows[:, : policy.hidden], decisions.hidden[WINDOW:], rtol=1e-5, atol=1e-6)

@@ -14,7 +14,7 @@ from jaxnav.evaluation import grid
 from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.evaluation.grid import Evaluator
 from jaxnav.evaluation.variants import inference_grid, table_row
-from jaxnav.policies.adaptation import WINDOW, replay_window
+from jaxnav.policies.adaptation import WINDOW, replay_window, zero_output_changes
 from jaxnav.policies.agent_loop import AgentLoop, policy_memory
 from jaxnav.policies.methods import find_method
 from jaxnav.policies.testing import check_method
@@ -95,10 +95,7 @@ def fall(weights, steps):
     policy = ACTING.bind(weights)
 
     def loss(fast):
-        nothing = {}
-        for layer, factors in fast.layer_changes.items():
-            nothing[layer] = jnp.zeros_like(factors.outputs[..., :WINDOW, :])
-        rows, _ = replay_window(policy, fast.window, fast.layer_changes, nothing)
+        rows, _ = replay_window(policy, fast.window, fast.layer_changes, zero_output_changes(fast.layer_changes))
         return policy.method.learned_loss(rows)  # type: ignore[attr-defined]
 
     def step(agent, key):

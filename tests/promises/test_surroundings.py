@@ -1,5 +1,6 @@
 """Environment variables, streams and settings of other programs are inputs: they do not matter, or get one line."""
 
+import contextlib
 import itertools
 import shutil
 
@@ -23,11 +24,18 @@ from jaxnav.viz.learning import learning_figure
 from jaxnav.viz.style import save_figure
 
 
+@contextlib.contextmanager
+def turned_on(setting):
+    """Turn a setting of JAX on, as its environment variable does."""
+    jax.config.update(setting, True)
+    yield
+    jax.config.update(setting, False)
+
+
 @pytest.fixture
 def x64():
-    jax.config.update("jax_enable_x64", True)
-    yield
-    jax.config.update("jax_enable_x64", False)
+    with turned_on("jax_enable_x64"):
+        yield
 
 
 # JAX
@@ -53,9 +61,8 @@ def test_commands_leave_the_64_bit_mode():
 
 @pytest.fixture
 def no_jit():
-    jax.config.update("jax_disable_jit", True)
-    yield
-    jax.config.update("jax_disable_jit", False)
+    with turned_on("jax_disable_jit"):
+        yield
 
 
 @pytest.mark.usefixtures("no_jit")

@@ -69,8 +69,11 @@ def test_groups_of_the_first_version_are_read(machine):
     assert memory.read_free_bytes() == GIB
 
 
-def test_free_memory_is_unknown_without_files_of_the_system(machine):
+@pytest.mark.parametrize("meminfo", [None, "", "MemTotal: 16 kB\nnot a table\n\n"])
+def test_free_memory_is_unknown_where_the_system_does_not_say(machine, meminfo):
     (machine / "meminfo").unlink()
+    if meminfo is not None:
+        (machine / "meminfo").write_text(meminfo)
     assert memory.read_free_bytes() is None
     memory.require_memory(10**18, "a run", "give less")
 
