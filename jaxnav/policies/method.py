@@ -109,7 +109,7 @@ class Experience(nnx.Module):
       sizes: the method's own integer sizes with their defaults, in addition to `Sizes`.
       width: Z, the size of the experience.
       is_empty: whether Z has no entries, so that layout weights have nothing to multiply.
-      reads_memory: whether `attend` reads the memory; training then unrolls the policy step by step.
+      reads_memory: whether `attend` reads the memory; training then computes the experience step by step.
       num_scene_inputs: number of inputs that the reading adds to the direct pathway of the scene, see `scene_inputs`.
     """
 

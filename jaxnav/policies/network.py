@@ -370,11 +370,6 @@ class Policy(Stream):
         return memory if self.adaptation is None else memory._replace(fast=self.adaptation.init(self, batch))
 
     @property
-    def needs_stepwise_replay(self) -> bool:
-        """True if training must unroll the policy step by step, because experience or adaptation reads the memory."""
-        return self.method.reads_memory or self.adaptation is not None
-
-    @property
     def experience_appearance(self) -> jax.Array:
         """Embeddings of the categories that experience reads, float32 [K, d]."""
         return self.appearance.embedding[...]

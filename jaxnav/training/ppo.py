@@ -44,7 +44,7 @@ from jax.sharding import PartitionSpec
 
 from jaxnav.causal import do
 from jaxnav.env.objectnav import EnvParams, Observation
-from jaxnav.numerics.recurrence import gru_step, unroll_gru
+from jaxnav.numerics.recurrence import UnrolledGRU, gru_step, unroll_gru
 from jaxnav.numerics.trees import tree_where
 from jaxnav.policies.agent_loop import Agent, AgentLoop, decide, policy_memory
 from jaxnav.policies.method import Knowledge, Method, Stage
@@ -442,9 +442,9 @@ def replay_rollout(policy: Policy, transitions: Transition, memory: PolicyState,
     )
     pathways = policy.encode(inputs)
 
-    # If only the GRU depends on the memory, everything else runs in parallel over time. If the experience or an
-    # adaptation reads the memory too, the whole policy is scanned over time.
-    replay_decisions = _replay_step_by_step if policy.needs_stepwise_replay else _replay_in_parallel
+    # An adaptation changes the layers within the rollout, so the whole policy is scanned over time. Otherwise all that
+    # does not depend on the memory runs in parallel over time.
+    replay_decisions = _replay_in_parallel if policy.adaptation is None else _replay_step_by_step
     factual_decision, counterfactual_decision = replay_decisions(policy, pathways, transitions, memory)
     return Replay(
         policy=policy,
@@ -459,30 +459,38 @@ def replay_rollout(policy: Policy, transitions: Transition, memory: PolicyState,
 def _replay_in_parallel(
     policy: Policy, pathways: Pathways, transitions: Transition, memory: PolicyState
 ) -> tuple[Decision, Decision]:
-    """Apply inputs and heads for all T steps in parallel; only the GRU runs step by step.
+    """Apply inputs and heads for all T steps in parallel; only the GRU, and what reads its memory, runs step by step.
 
     Returns:
       Factual and counterfactual decisions, leaves [T, B, ...].
     """
-    # Mask as while acting. `policy.decide` is not called here, so the experience is masked by hand.
-    pathways = mask_experience(pathways, transitions.use_experience)
-    factual_pathways = mask_direct_pathways(pathways, transitions.use_direct)
-    counterfactual_pathways = do(pathways, scene=0.0, goal=0.0)
-
     # previous_action[t] = action[t - 1]: from the initial memory at t = 0, NO_ACTION where an episode begins.
     next_previous_action = jnp.where(transitions.ended, NO_ACTION, transitions.action)
     previous_action = jnp.concatenate([memory.action[None], next_previous_action[:-1]])
 
-    # Factual: unroll the GRU through time, input gates [T, B, 3 H].
-    mediated_input = policy.mediated_input(pathways, previous_action)
-    factual_gates = policy.input_gates(policy.direct_input(factual_pathways) + mediated_input)
-    unrolled_core = unroll_gru(policy.recurrent_kernel, factual_gates, transitions.ended, memory.hidden)
+    # Mask the direct pathways as while acting.
+    direct_input = policy.direct_input(mask_direct_pathways(pathways, transitions.use_direct))
+
+    # Factual: unroll the GRU through time. `policy.decide` is not called here, so the experience is masked by hand.
+    if policy.method.reads_memory:
+        unrolled_core = _unroll_with_attention(policy, pathways, direct_input, previous_action, transitions, memory)
+        # The counterfactual branch reads the same experience, but no gradient of it enters the factual memory.
+        memory_before = memory._replace(hidden=unrolled_core.hidden_before, action=previous_action)
+        pathways = mask_experience(policy.attend(pathways, memory_before), transitions.use_experience)
+        mediated_input = policy.mediated_input(pathways, previous_action)
+    else:
+        pathways = mask_experience(pathways, transitions.use_experience)
+        mediated_input = policy.mediated_input(pathways, previous_action)
+        factual_gates = policy.input_gates(direct_input + mediated_input)
+        unrolled_core = unroll_gru(policy.recurrent_kernel, factual_gates, transitions.ended, memory.hidden)
+    factual_pathways = mask_direct_pathways(pathways, transitions.use_direct)
     factual_decision = policy.apply_heads(unrolled_core.hidden_after, factual_pathways)
 
     # Counterfactual: the mediated input only.
+    counterfactual_pathways = do(pathways, scene=0.0, goal=0.0)
     counterfactual_gates = policy.input_gates(mediated_input)
     if memory.counterfactual_hidden is None:
-        # One GRU step at each time, from the factual hidden state before it. `unroll_gru` treats that state as a
+        # One GRU step at each time, from the factual hidden state before it. The unrolled core treats that state as a
         # constant, so no gradient enters it.
         counterfactual_hidden = gru_step(counterfactual_gates, unrolled_core.hidden_gates, unrolled_core.hidden_before)
     else:
@@ -493,10 +501,50 @@ def _replay_in_parallel(
     return factual_decision, policy.apply_heads(counterfactual_hidden, counterfactual_pathways)
 
 
+def _unroll_with_attention(
+    policy: Policy,
+    pathways: Pathways,
+    direct_input: jax.Array,
+    previous_action: jax.Array,
+    transitions: Transition,
+    memory: PolicyState,
+) -> UnrolledGRU:
+    """Unroll the GRU of a policy whose experience attends from the recurrent state.
+
+    Args:
+      policy: policy whose method reads the memory.
+      pathways: outputs of `policy.encode`, leaves [T, B, ...].
+      direct_input: float32 [T, B, H], the projected direct pathways.
+      previous_action: int32 [T, B].
+      transitions: leaves [T, B, ...].
+      memory: memories before the first step, leaves [B, ...].
+
+    Returns:
+      The states along the rollout, with gradients as those of `unroll_gru`.
+    """
+
+    def step(hidden_before: jax.Array, inputs: Any) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        encoded, direct_input, previous_action, use_experience, ended = inputs
+        # The experience attends from the state before the step, then the GRU advances.
+        memory_before = memory._replace(hidden=hidden_before, action=previous_action)
+        attended = mask_experience(policy.attend(encoded, memory_before), use_experience)
+        input_gates = policy.input_gates(direct_input + policy.mediated_input(attended, previous_action))
+        hidden_after = gru_step(input_gates, policy.hidden_gates(hidden_before), hidden_before)
+
+        # An ended episode starts again from zeros.
+        next_hidden = jnp.where(ended[:, None], 0.0, hidden_after)
+        return next_hidden, (hidden_after, hidden_before)
+
+    scan_inputs = pathways, direct_input, previous_action, transitions.use_experience, transitions.ended
+    _, (hidden_after, hidden_before) = jax.lax.scan(step, memory.hidden, scan_inputs)
+    hidden_before = jax.lax.stop_gradient(hidden_before)
+    return UnrolledGRU(hidden_after, hidden_before, policy.hidden_gates(hidden_before))
+
+
 def _replay_step_by_step(
     policy: Policy, pathways: Pathways, transitions: Transition, memory: PolicyState
 ) -> tuple[Decision, Decision]:
-    """Scan the whole policy over time, for policies whose experience or adaptation reads the memory.
+    """Scan the whole policy over time, for policies that adapt within an episode.
 
     Returns:
       Factual and counterfactual decisions, leaves [T, B, ...].

@@ -165,7 +165,7 @@ def test_replay_rollout_recomputes_log_probs_and_values(name):
 
 
 @pytest.mark.slow
-def test_step_by_step_replay_equals_the_parallel_replay():
+def test_replay_with_attention_equals_the_parallel_replay():
     """Decisions, counterfactual decisions and the gradient of the whole loss are those of ORG."""
     rollout = collect_method_rollout("STEPWISE").rollout
     org_spec = dataclasses.replace(SPECS["STEPWISE"], method=find_method("org"))

@@ -253,7 +253,7 @@ def test_agent_without_trials_decides_without_changes(agent_loop):
 
 def test_policy_without_inner_steps_is_replayed_in_parallel():
     policy = dataclasses.replace(AGENT_LOOP, inner_steps=0).bind(tiny.random_params(0, SPEC))
-    assert not policy.needs_stepwise_replay
+    assert policy.adaptation is None
 
 
 # Training

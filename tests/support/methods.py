@@ -36,7 +36,7 @@ ATTENTIVE = Method(Attention)
 
 
 class StepwiseRelations(ObjectRelations):
-    """ORG, unrolled step by step though it does not attend."""
+    """ORG, whose experience training computes step by step, though it does not attend."""
 
     reads_memory = True
 

@@ -49,6 +49,7 @@ FUNCTIONS = {
         "compute_advantages",
         "replay_rollout",
         "_replay_in_parallel",
+        "_unroll_with_attention",
         "_replay_step_by_step",
         "ppo_loss",
     },

@@ -145,8 +145,10 @@ def distil_loss(decisions):
     return (jnp.exp(target) * (target - jax.nn.log_softmax(counterfactual.logits))).sum()
 
 
-def test_both_kinds_of_replay_agree_in_decisions_and_gradients():
-    agent_loop, weights, rollouts, _ = collect_two_rollouts("org")
+@pytest.mark.parametrize("kind", ["own", "factual"])
+@pytest.mark.parametrize("method_name", ["org", pytest.param("support.methods:ATTENTIVE", marks=pytest.mark.slow)])
+def test_both_kinds_of_replay_agree_in_decisions_and_gradients(method_name, kind):
+    agent_loop, weights, rollouts, _ = collect_two_rollouts(method_name, kind)
     rollout = rollouts[1]
     assert rollout.transitions.ended[:-1].sum() > 20
     results = []
@@ -174,9 +176,8 @@ def test_both_kinds_of_replay_agree_in_decisions_and_gradients():
 def test_replay_repeats_the_memory_that_acting_carries(method_name):
     agent_loop, weights, rollouts, last_agent = collect_two_rollouts(method_name)
     memories = [rollouts[0].initial_memory, rollouts[1].initial_memory, last_agent.memory]
-    kinds = [ppo._replay_step_by_step] if "ATTENTIVE" in method_name else [ppo._replay_in_parallel]
     for rollout, next_memory in zip(rollouts, memories[1:], strict=True):
-        _, counterfactual = replay_as(kinds[0], agent_loop, weights, rollout)
+        _, counterfactual = replay_as(ppo._replay_in_parallel, agent_loop, weights, rollout)
         has_ended = rollout.transitions.ended[-1][:, None]
         expected = np.where(has_ended, 0.0, counterfactual.hidden[-1])
         np.testing.assert_allclose(next_memory.counterfactual_hidden, expected, atol=1e-5)
