@@ -140,7 +140,7 @@ def paired_difference(
 
     Args:
       reference: bool, int or float [S, E], finite.
-      compared: the same shape.
+      compared: the same shape; sides that were trained separately may differ in S.
       scenes: clusters of the E episodes.
       same_runs: True if row s of both sides is the same network (sTDE against no removal). Otherwise, the two sides
         were trained separately: `std` is sqrt(std_reference^2 + std_compared^2), and there are no `seeds`.
@@ -149,18 +149,20 @@ def paired_difference(
     Raises:
       InputError: see `mean_interval`; or the shapes of `reference` and `compared` differ.
     """
-    reference, compared = _as_paired_results(reference, compared, scenes)
+    # With fixed policies, or with the same networks, the differences themselves are results [S, E].
+    if not trained or same_runs:
+        reference, compared = _as_paired_results(reference, compared, scenes)
+        difference = compared - reference
+        return _mean_over_runs(difference, scenes) if trained else mean_interval(difference, scenes, trained=False)
 
-    # With the same networks, or with fixed policies, the differences themselves are results [S, E].
-    difference = compared - reference
-    if not trained:
-        return mean_interval(difference, scenes, trained=False)
-    if same_runs:
-        return _mean_over_runs(difference, scenes)
-
-    # Separate runs: the mean over both arms, with the reference negated, is half of the difference.
-    runs = run_clusters(2, len(reference))
-    signed_results = 2.0 * np.concatenate([-reference, compared])
+    # Separate runs: the difference is one mean over the runs of both sides, with the reference negated. Every run is
+    # scaled by the number of runs over those of its side, so that both sides count as much.
+    reference = _as_finite_results("reference", reference, scenes)
+    compared = _as_finite_results("compared", compared, scenes)
+    runs_by_side = np.array([len(reference), len(compared)])
+    num_runs = runs_by_side.sum()
+    runs = leave_one_out(np.arange(num_runs), np.repeat([0, 1], runs_by_side))
+    signed_results = np.concatenate([-reference * (num_runs / len(reference)), compared * (num_runs / len(compared))])
     replicates = runs.weights.T @ signed_results @ scenes.weights / signed_results.size
     combined_std = math.hypot(_std(reference.mean(axis=1)), _std(compared.mean(axis=1)))
     return jackknife_interval(replicates, scenes, runs, std=combined_std)

@@ -236,13 +236,15 @@ def _check_folds(config: ExperimentConfig) -> None:
 
 
 def _check_seeds(runs: list[AgentRun]) -> None:
-    """Check that agents that are compared have as many seeds."""
+    """Check that agents that are compared with the random actions of others have as many seeds."""
     seeds = {(run.world, run.agent): run.config.seeds for run in runs}
     for run in runs:
         for reference in run.against:
-            agent = reference.partition("/")[0]
-            if seeds.get((run.world, agent), run.config.seeds) != run.config.seeds:
-                raise InputError(f"{run.name}: has other seeds than {agent}, with which it is compared; give as many")
+            agent, _, variant = reference.partition("/")
+            if variant == "random" and seeds.get((run.world, agent), run.config.seeds) != run.config.seeds:
+                raise InputError(
+                    f"{run.name}: has other seeds than {agent}, with whose random actions it is compared; give as many"
+                )
 
 
 def _check_references(config: ExperimentConfig, key: str, references: Any) -> None:

@@ -331,19 +331,24 @@ def measure_groups(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
         if not members or not references:
             continue
 
-        # The effect varies with the networks of both sides, unless they are the same or the reference has none.
+        # The effect varies with the networks of both sides, unless they are the same or the reference has none. Agents
+        # may differ in their number of training runs; a group has as many as each of its agents.
         compared = [member[variant] for member in members]
         clusters = compared[0].episodes.clusters()
         is_untrained = agent_variant in UNTRAINED_VARIANTS
         same_networks = not agent and "baseline" not in (variant, reference)
+        num_runs = min(len(scores.metrics["sr"]) for scores in (*compared, *references))
         effect = paired_difference(
-            _mean_sr(references), _mean_sr(compared), clusters, same_runs=is_untrained or same_networks
+            _mean_sr(references, num_runs),
+            _mean_sr(compared, num_runs),
+            clusters,
+            same_runs=is_untrained or same_networks,
         )
         fields = {"world": run.world, "run": name, "variant": variant, "decoding": "argmax", "shift": shift}
         yield ResultRow(**fields, reference=reference, metric="sr", value=effect)
         yield ResultRow(**fields, reference=reference, metric="agents", value=Interval(float(len(members))))
 
 
-def _mean_sr(scores: Sequence[VariantScores]) -> np.ndarray:
-    """Average success over agents, run by run, [S, E]."""
-    return np.mean([variant.metrics["sr"] for variant in scores], axis=0)
+def _mean_sr(scores: Sequence[VariantScores], num_runs: int) -> np.ndarray:
+    """Average success over agents, run by run, [S, E], in the first S training runs."""
+    return np.mean([variant.metrics["sr"][:num_runs] for variant in scores], axis=0)

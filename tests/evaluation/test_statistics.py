@@ -168,6 +168,21 @@ def test_difference_of_separate_runs_adds_their_variances():
     assert half_width(same_run_gain) == pytest.approx(t.ppf(0.975, 1) * math.sqrt(2 / 2))
 
 
+def test_difference_of_separate_runs_allows_different_numbers_of_runs():
+    # Scenes alike; run means 0, 2 and 1, 5, 9: means 1 and 5, variances 2 / 2 and 16 / 3, and 1 + 2 degrees of freedom.
+    first_values = np.repeat([[0.0], [2.0]], 6, axis=1)
+    last_values = np.repeat([[1.0], [5.0], [9.0]], 6, axis=1)
+    gain = paired_difference(first_values, last_values, scenes_of(6))
+    assert gain.mean == pytest.approx(4)
+    assert gain.std == pytest.approx(math.sqrt(2 + 16))
+    assert half_width(gain) == pytest.approx(t.ppf(0.975, 3) * math.sqrt(2 / 2 + 16 / 3))
+
+    # The same networks, or fixed policies, are paired run by run.
+    for fixed_settings in ({"same_runs": True}, {"trained": False}):
+        with pytest.raises(InputError, match="shape"):
+            paired_difference(first_values, last_values, scenes_of(6), **fixed_settings)
+
+
 @settings(max_examples=30)
 @given(st.lists(st.booleans(), min_size=24, max_size=24), st.booleans())
 def test_swapping_arms_negates_the_difference(outcomes, same_runs):
@@ -225,9 +240,10 @@ def test_intervals_refuse_bad_values(values, message):
         paired_difference(values, values, scenes_of(2))
 
 
-def test_paired_difference_refuses_unequal_shapes():
-    with pytest.raises(InputError, match="shape"):
-        paired_difference(np.zeros((2, 4)), np.zeros((3, 4)), scenes_of(4))
+@pytest.mark.parametrize("same_runs", [False, True])
+def test_paired_difference_refuses_unequal_episodes(same_runs):
+    with pytest.raises(InputError, match="3 episodes"):
+        paired_difference(np.zeros((2, 4)), np.zeros((2, 3)), scenes_of(4), same_runs=same_runs)
 
 
 # Coverage

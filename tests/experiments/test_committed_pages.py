@@ -106,14 +106,15 @@ def test_pages_can_be_written_from_the_first_result_on(name, tmp_path):
 # Agents of the tables
 
 
-def test_table_2_has_the_methods_of_the_paper():
-    # Beside them are layout-blind agents, and EOTP adapted to ever changing scenes.
-    methods = set(COMMITTED["table2"].agents) - {"anonymous", "eotp:ADAPTED"}
+@pytest.mark.parametrize("name", ["table2"])
+def test_table_2_has_the_methods_of_the_paper(name):
+    # Beside them are layout-blind agents, EOTP adapted to ever changing scenes, and further seeds of ORG.
+    methods = set(COMMITTED[name].agents) - {"anonymous", "eotp:ADAPTED", "org-again"}
     hosts = {method for method in methods if not method.endswith("-streams")}
     assert hosts == {"rgb", "sp", "savn", "eotp", "org", "tpn", "vtnet", "hoz"}
 
     # Whatever hosts the layout is trained without and with it, and with two streams.
-    for run in agent_runs(COMMITTED["table2"]):
+    for run in agent_runs(COMMITTED[name]):
         hosts_layout = find_method(run.config.method).hosts_layout
         if run.agent.endswith("-streams"):
             assert (run.config.decision, run.config.arms) == ("streams", ("layout",))
@@ -131,7 +132,7 @@ def test_all_methods_of_a_world_learn_from_as_many_steps(name):
             runs_by_world.setdefault(run.world, []).append(run)
     for runs in runs_by_world.values():
         assert len({total_steps([run]) for run in runs}) == 1
-        assert len({run.config.seeds for run in runs}) == 1
+        assert {run.config.seeds for run in runs} <= {3, 5}
 
 
 @pytest.mark.parametrize("name", ["table3", "real_homes"])

@@ -184,7 +184,7 @@ def test_finished_runs_of_agents_keep_their_settings_and_references(drawn_run):
         ({"agents": {"plain": {"against": ["plain/layuot"]}}}, "agents.plain.against.*'layuot'"),
         ({"agents": {"plain": {"against": "plain"}}}, "agents.plain.against"),
         ({"agents": {"plain": {"run": "nowhere"}}}, "nowhere"),
-        ({"agents": {"plain": {"against": ["wide"]}, "wide": {"seeds": 5}}}, "near-plain.*seeds"),
+        ({"agents": {"plain": {"against": ["wide/random"]}, "wide": {"seeds": 5}}}, "near-plain.*seeds"),
         # Measurements and groups.
         ({"measure": {"evaluation": ["plane"]}}, "measure.evaluation"),
         ({"measure": {"evaluation": ["plain", "plane"]}}, "measure.evaluation: 'plane'"),
