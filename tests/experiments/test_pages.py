@@ -486,6 +486,45 @@ def test_orderings_are_judged_by_their_intervals(tmp_path):
     assert cells["apartments: all"][-1] == cells["gains of hosts: apartments over rooms"][-1] == "not run"
 
 
+def make_share(run: str, variant: str, share: float) -> ResultRow:
+    """Share of the decisions that other categories change."""
+    fields = {"variant": variant, "decoding": "argmax", "shift": 0.0, "metric": "share of other_categories"}
+    return make_row(make_interval(share), run=run, **fields)
+
+
+def test_hosts_with_idle_experience_have_no_verdict(tmp_path):
+    effects = [make_effect("rooms", run, "layout", "baseline", make_interval(5.0)) for run in ("org", "hoz")]
+    # The share of the arm with w counts.
+    shares = [make_share("org", "baseline", 20.0), make_share("org", "layout", 4.9), make_share("hoz", "layout", 5.0)]
+    cells = read_lines(render_paper(tmp_path, *effects, *shares))
+    assert cells["rooms: `hoz` + w over `hoz`"][-2:] == ["5.0 [4.0, 6.0]", "holds"]
+    idle_cells = cells['<span class="idle">rooms: `org` + w over `org`</span>']
+    assert "4.9 [3.9, 5.9]" in idle_cells[-2]
+    assert "experience is idle" in idle_cells[-1]
+
+
+def test_methods_with_idle_experience_have_no_verdict(tmp_path):
+    agents = {
+        "anonymous": {"method": "anonymous", "arms": ["baseline"]},
+        "org": {"against": ["anonymous"]},
+        "hoz": {"method": "hoz", "against": ["anonymous"]},
+    }
+    config = ExperimentConfig(agents=agents, shifts=(0.0,), reference="anonymous")
+    rows = make_agent_rows("rooms", "anonymous", baseline=50.0)
+    for run, share in (("org", 2.0), ("hoz", 12.0)):
+        rows += [
+            *make_agent_rows("rooms", run, baseline=60.0, layout=65.0),
+            make_effect("rooms", run, "baseline", "anonymous/baseline", make_interval(10.0)),
+            make_effect("rooms", run, "layout", "baseline", make_interval(5.0)),
+            make_share(run, "layout", share),
+        ]
+    section = render(tmp_path, "methods", *rows, config=config).split("### Verdicts")[1].split("###")[0]
+    cells = read_lines(section)
+    assert cells["`hoz`"][:2] == ["+10.0 [+9.0, +11.0]<br>**holds**", "+5.0 [+4.0, +6.0]<br>**holds**"]
+    assert cells["`hoz`"][-1] == "12.0 [11.0, 13.0]"
+    assert "holds" not in "".join(cells['<span class="idle">`org`</span>'])
+
+
 def test_gains_of_worlds_are_compared_by_both_intervals(tmp_path):
     rows = [
         make_effect("apartments", "hosts", "stde", "baseline", make_interval(10.0)),
