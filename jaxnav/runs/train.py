@@ -32,6 +32,7 @@ from rich.table import Column
 
 from jaxnav.env.objectnav import EnvParams, ObjectNav
 from jaxnav.errors import InputError, Interrupted, MissingSplitError
+from jaxnav.gaps import NUM_NEAR_FEATURES
 from jaxnav.layout import ESTIMATORS, EstimatorConfig
 from jaxnav.plain_console import PlainConsole, to_plain_console
 from jaxnav.policies.agent_loop import AgentLoop
@@ -77,6 +78,7 @@ from jaxnav.training.calibration import (
     fit_shift_classifier,
     fit_sighting_classifier,
     layout_priors,
+    limit_walks,
 )
 from jaxnav.training.devices import (
     Devices,
@@ -429,7 +431,8 @@ def learn_knowledge(
 
     # Log odds that a pair of categories seen together indicates a shifted layout.
     key = jax.random.fold_in(jax.random.key(config.seed), _COOCCURRENCE)
-    num_walks = _EVIDENCE_WALK_FACTOR * config.layout.walks
+    num_categories = exploration.counts.shape[-1]
+    num_walks = limit_walks(_EVIDENCE_WALK_FACTOR * config.layout.walks, 1, num_categories)
     is_pooled = config.layout.prior == "pooled"
     learn_evidence = jax.jit(fit_shift_classifier, static_argnums=(0, 4, 5))
     env_params = world.make_env_params(0)
@@ -437,7 +440,7 @@ def learn_knowledge(
 
     # Log odds of the distances at which pairs were seen.
     near_key = jax.random.fold_in(jax.random.key(config.seed), _SIGHTINGS)
-    num_walks = _SIGHTING_WALK_FACTOR * config.layout.walks
+    num_walks = limit_walks(_SIGHTING_WALK_FACTOR * config.layout.walks, NUM_NEAR_FEATURES, num_categories)
     learn_near_evidence = jax.jit(fit_sighting_classifier, static_argnums=(0, 4, 5))
     near_log_odds = learn_near_evidence(world.env, env_params, exploration.counts, near_key, num_walks, is_pooled)
     return Knowledge(layout, method_knowledge, cooccurrence._replace(near_log_odds=near_log_odds))

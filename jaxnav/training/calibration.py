@@ -42,14 +42,16 @@ LATE_STEP = 20
 _WALK_LENGTHS = (1, 2, 5, 10, 20, 40, 60)
 #: The same for the sightings of a walk, whose evidence grows for longer.
 _SIGHTING_LENGTHS = (5, 10, 20, 40, 80, 120)
-#: Number of walks whose sightings are computed at once.
-_SIGHTING_BATCH = 64
+#: Number of walks whose pairs are computed at once: those of all views of a walk take much memory with many categories.
+_WALK_BATCH = 64
 #: Standard deviation of the noise on the frequency ranks by which categories are paired for an exchange, in ranks.
 _RANK_NOISE = 3.0
 #: Weight of the squared log odds in the loss of the regression.
 _L2_WEIGHT = 1e-3
 #: Share of the scenes that is held out of the regression to calibrate its scale.
 _CALIBRATION_SHARE = 0.25
+#: Bytes of the examples of a regression, above which it learns from fewer walks (`limit_walks`).
+_MAX_EXAMPLE_BYTES = 2**31
 #: Steps and learning rate of Adam in the fits.
 _NUM_FIT_STEPS = 100
 _FIT_LEARNING_RATE = 0.1
@@ -323,6 +325,25 @@ def _measure_gaps(
 # 3. Shift classifier
 
 
+def limit_walks(num_walks: int, num_features: int, num_categories: int) -> int:
+    """Number of walks whose examples fit into 2 GiB; the usual number up to about 80 categories.
+
+    The examples are float32, two for each walk: features of all pairs in both layouts. The whole regression takes about
+    twice as much memory.
+
+    Args:
+      num_walks: number of walks that is wanted.
+      num_features: F, features of a pair.
+      num_categories: K.
+
+    Returns:
+      At least 1, and at most `num_walks`.
+    """
+    num_pairs = num_categories * (num_categories - 1) // 2
+    bytes_per_walk = 2 * 4 * num_features * num_pairs
+    return max(1, min(num_walks, _MAX_EXAMPLE_BYTES // bytes_per_walk))
+
+
 def fit_shift_classifier(
     env: ObjectNav,
     env_params: EnvParams,
@@ -354,7 +375,7 @@ def fit_shift_classifier(
     presence = env.row_format.presence(env_params.tables.rows[poses])  # [W, T + 1, K]
     lengths = jax.random.choice(length_key, jnp.array(_WALK_LENGTHS), (num_walks,))
     is_before_cut = jnp.arange(presence.shape[1])[None] <= lengths[:, None]
-    co_seen = jax.vmap(seen_together)(presence & is_before_cut[..., None])
+    co_seen = jax.lax.map(seen_together, presence & is_before_cut[..., None], batch_size=_WALK_BATCH)
 
     log_odds = _fit_against_exchanges(co_seen[:, None], scene, env, env_params, counts, key, pooled)[:, 0]
     return CooccurrenceEvidence(log_odds=log_odds, co_visibility=co_visibility_from_counts(counts))
@@ -390,7 +411,7 @@ def fit_sighting_classifier(
     poses, scene = _walk(env, env_params, walk_key, num_walks, _SIGHTING_LENGTHS[-1])
     lengths = jax.random.choice(length_key, jnp.array(_SIGHTING_LENGTHS), (num_walks,))
     count_sightings = partial(_count_sightings, env, env_params)
-    sightings = jax.lax.map(lambda walk: count_sightings(*walk), (poses, lengths), batch_size=_SIGHTING_BATCH)
+    sightings = jax.lax.map(lambda walk: count_sightings(*walk), (poses, lengths), batch_size=_WALK_BATCH)
 
     return _fit_against_exchanges(near_features(sightings), scene, env, env_params, counts, key, pooled)
 

@@ -25,10 +25,20 @@ from jaxnav.training.calibration import (
     explore,
     fit_shift_classifier,
     fit_sighting_classifier,
+    limit_walks,
 )
 
 K = 9
 EXCHANGE = jax.jit(draw_category_exchange)
+
+
+def test_many_categories_limit_the_walks_of_a_regression():
+    # 200 categories have 200 * 199 / 2 = 19,900 pairs with 20 features, in two layouts 3,184,000 bytes a walk; 2 GiB
+    # hold 674 of them.
+    assert limit_walks(4096, 20, 200) == 674
+    # 22 categories have 231 pairs, 36,960 bytes a walk.
+    assert limit_walks(4096, 20, 22) == 4096
+    assert limit_walks(4096, 20, 10_000) == 1
 
 
 @given(st.integers(0, 2**32 - 2), st.lists(st.booleans(), min_size=K, max_size=K))
