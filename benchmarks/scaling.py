@@ -44,7 +44,7 @@ from jax.sharding import Mesh, PartitionSpec
 
 from jaxnav.runs.config import LayoutConfig, RunConfig
 from jaxnav.store.checkpoint import save_checkpoint
-from jaxnav.store.files import append_log_rows
+from jaxnav.store.files import append_log_rows, make_manifest
 from jaxnav.training.devices import Devices, is_first_process
 from jaxnav.training.shares import ENV_AXIS, SEED_AXIS
 
@@ -125,7 +125,7 @@ class Training:
         self._states, _ = self._trainer.train(self._states, self._params)
 
     def save(self, folder: Path) -> None:
-        save_checkpoint(folder, 1, self._trainer.unpack(self._states), {})
+        save_checkpoint(folder, 1, self._trainer.unpack(self._states), make_manifest({}))
 
     def count_bytes(self) -> dict[str, int]:
         """Return the bytes of the parameters and of a device's episodes."""
