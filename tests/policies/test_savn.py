@@ -1,7 +1,8 @@
-"""SAVN: its loss falls, its changes are an episode's own in rollout, replay and evaluation, and they change actions."""
+"""SAVN: its loss falls, and its changes belong to a single episode in rollout, replay and evaluation."""
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ from support.rollouts import ENV, ENVS, KNOWLEDGE, LENGTH, PARAMS
 
 from jaxnav.evaluation import grid
 from jaxnav.evaluation.episodes import draw_episodes
-from jaxnav.evaluation.grid import Evaluator
+from jaxnav.evaluation.grid import EpisodeOutcome, Evaluator
 from jaxnav.evaluation.variants import inference_grid, table_row
 from jaxnav.policies.adaptation import WINDOW, replay_window, zero_output_changes
 from jaxnav.policies.agent_loop import AgentLoop, policy_memory
@@ -21,109 +22,139 @@ from jaxnav.policies.testing import check_method
 from jaxnav.training.config import PPOConfig
 from jaxnav.training.ppo import Learner, collect_rollout, replay_rollout
 
-LIMIT = 30
 SPEC = dataclasses.replace(tiny.SPEC, method=find_method("savn"), method_sizes=())
-ACTING = AgentLoop(ENV, SPEC)
-LONG = PARAMS.replace(step_limit=jnp.full(2, LIMIT, jnp.int32))
+AGENT_LOOP = AgentLoop(ENV, SPEC)
+#: Episodes of up to 30 actions, which have five windows.
+LONG_PARAMS = PARAMS.replace(step_limit=jnp.full(2, 30, jnp.int32))
 
 
-def changed(fast):
-    """Which episodes have changed kernels, bool [B]."""
-    return np.stack([np.abs(factors.outputs).max(axis=(-1, -2)) > 0 for factors in fast.layer_changes.values()]).all(
-        axis=0
-    )
+def has_changes(fast_weights: Any) -> np.ndarray:
+    """True for episodes all of whose layers are changed, bool [B]."""
+    changed_layers = []
+    for change in fast_weights.layer_changes.values():
+        changed_layers.append(np.abs(change.outputs).max(axis=(-1, -2)) > 0)
+    return np.all(changed_layers, axis=0)
 
 
 @pytest.mark.slow
 def test_replay_decides_and_adapts_as_the_rollout_did():
-    weights = tiny.random_params(3, SPEC)
+    policy_params = tiny.random_params(3, SPEC)
 
     @jax.jit
-    def go():
-        policy = ACTING.bind(weights)
-        agent = ACTING.start(jax.random.key(0), ENVS, policy.initial_memory((ENVS,)), KNOWLEDGE, PARAMS)
-        agent, _ = collect_rollout(ACTING, policy, agent, jax.random.key(1), PARAMS, KNOWLEDGE, num_steps=LENGTH)
-        agent, rollout = collect_rollout(ACTING, policy, agent, jax.random.key(2), PARAMS, KNOWLEDGE, num_steps=LENGTH)
+    def collect_and_replay():
+        # The second rollout begins within episodes.
+        policy = AGENT_LOOP.bind(policy_params)
+        agent = AGENT_LOOP.start(jax.random.key(0), ENVS, policy.initial_memory((ENVS,)), KNOWLEDGE, PARAMS)
+        for number in (1, 2):
+            agent, rollout = collect_rollout(
+                AGENT_LOOP, policy, agent, jax.random.key(number), PARAMS, KNOWLEDGE, num_steps=LENGTH
+            )
         return agent, rollout, replay_rollout(policy, rollout.transitions, rollout.initial_memory, PARAMS).factual
 
-    agent, rollout, again = go()
+    agent, rollout, decisions = collect_and_replay()
     transitions = rollout.transitions
-    log_prob = jnp.take_along_axis(jax.nn.log_softmax(again.logits), transitions.choice[..., None], axis=-1)[..., 0]
+    log_probs = jax.nn.log_softmax(decisions.logits)
+    log_prob = jnp.take_along_axis(log_probs, transitions.choice[..., None], axis=-1)[..., 0]
     np.testing.assert_allclose(log_prob, transitions.log_prob, rtol=1e-4, atol=1e-4)
-    fast, running = policy_memory(agent).fast, ~np.asarray(transitions.ended[-1])
-    replayed = jax.tree.map(lambda leaf: leaf[-1], again.fast)
-    for layer, factors in fast.layer_changes.items():
-        expected = replayed.layer_changes[layer].outputs
-        np.testing.assert_allclose(factors.outputs[running], expected[running], rtol=1e-3, atol=1e-5)
-    # New with the episode: nothing is changed before its own sixth decision.
-    np.testing.assert_array_equal(fast.num_decisions, agent.state.time)
-    np.testing.assert_array_equal(changed(fast), np.asarray(agent.state.time) >= WINDOW)
-    assert 0 < changed(fast).sum() < ENVS
+
+    # Episodes that go on have the changes of the last replayed step.
+    fast_weights = policy_memory(agent).fast
+    is_running = ~np.asarray(transitions.ended[-1])
+    for layer, change in fast_weights.layer_changes.items():
+        replayed_change = decisions.fast.layer_changes[layer].outputs[-1]
+        np.testing.assert_allclose(change.outputs[is_running], replayed_change[is_running], rtol=1e-3, atol=1e-5)
+
+    # A new episode has no changes before its sixth decision.
+    np.testing.assert_array_equal(fast_weights.num_decisions, agent.state.time)
+    np.testing.assert_array_equal(has_changes(fast_weights), np.asarray(agent.state.time) >= WINDOW)
+    assert 0 < has_changes(fast_weights).sum() < ENVS
 
 
 @functools.cache
-def outcome(inner_steps=None):
+def evaluate(inner_steps: int | None = None) -> EpisodeOutcome:
+    """Evaluate a random policy with sampled actions, leaves [1, 32]."""
     episodes = draw_episodes(tiny.BANK, 32, seed=1)
     rows = inference_grid([table_row("baseline", None, None, "sample")], ("baseline",), 1)
-    weights = tiny.random_params(0, SPEC)
-    weights["actor"]["kernel"] = 0.3 * weights["actor"]["kernel"]  # long episodes
-    weights = jax.tree.map(lambda leaf: leaf[None], weights)
-    acting = dataclasses.replace(ACTING, inner_steps=inner_steps)
-    return Evaluator(acting, can_remove=False)(rows, weights, [(episodes, LONG)], KNOWLEDGE, jax.random.key(0))
+    policy_params = tiny.random_params(0, SPEC)
+    # Small logits make Done unlikely, so that episodes are long.
+    policy_params["actor"]["kernel"] = 0.3 * policy_params["actor"]["kernel"]
+    params_by_seed = jax.tree.map(lambda leaf: leaf[None], policy_params)
+    evaluator = Evaluator(dataclasses.replace(AGENT_LOOP, inner_steps=inner_steps), can_remove=False)
+    return evaluator(rows, params_by_seed, [(episodes, LONG_PARAMS)], KNOWLEDGE, jax.random.key(0))
 
 
 @pytest.mark.slow
-def test_evaluation_carries_the_changes_of_episodes_that_go_on(monkeypatch):
-    with_parts = outcome()
-    assert len(set(with_parts.length[0])) > 5
-    assert (with_parts.length > WINDOW).any()
+def test_smaller_batches_of_an_evaluation_keep_the_changes_of_running_episodes(monkeypatch):
+    outcome = evaluate()
+    assert len(set(outcome.length[0])) > 5
+    assert (outcome.length > WINDOW).any()
+    # The same episodes in one batch to the end.
     monkeypatch.setattr(grid, "_BATCH_DIVISORS", ())
-    jax.tree.map(np.testing.assert_array_equal, with_parts, outcome.__wrapped__())
+    jax.tree.map(np.testing.assert_array_equal, outcome, evaluate.__wrapped__())
 
 
 @pytest.mark.slow
-def test_without_adaptation_actions_are_others_after_the_first_window():
-    adapted, plain = outcome(), outcome(0)
-    differs = (adapted.length != plain.length) | (adapted.moves != plain.moves)
+def test_without_adaptation_actions_differ_only_after_the_first_window():
+    adapted = evaluate()
+    unadapted = evaluate(inner_steps=0)
+    differs = (adapted.length != unadapted.length) | (adapted.moves != unadapted.moves)
     assert differs.any()
-    assert not differs[np.minimum(adapted.length, plain.length) <= WINDOW].any()
+    ends_in_first_window = np.minimum(adapted.length, unadapted.length) <= WINDOW
+    assert not differs[ends_in_first_window].any()
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def fall(weights, steps):
-    """Which windows are full, bool [T, B], and the learned loss of each before and after its step."""
-    policy = ACTING.bind(weights)
+def losses_around_inner_steps(policy_params: Any, num_steps: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Act, and compute the learned loss of the current window before and after each decision's inner step.
 
-    def loss(fast):
-        rows, _ = replay_window(policy, fast.window, fast.layer_changes, zero_output_changes(fast.layer_changes))
+    Returns:
+      Where an inner step was taken, bool [T, B], and the losses before and after it, float32 [T, B].
+    """
+    policy = AGENT_LOOP.bind(policy_params)
+
+    def window_loss(fast_weights):
+        no_changes = zero_output_changes(fast_weights.layer_changes)
+        rows, _ = replay_window(policy, fast_weights.window, fast_weights.layer_changes, no_changes)
         return policy.method.learned_loss(rows)  # type: ignore[attr-defined]
 
-    def step(agent, key):
+    def act(agent, key):
         memory = policy_memory(agent)
-        decision = policy.decide(policy.pathways(ACTING.policy_inputs(agent, KNOWLEDGE, LONG), memory), memory)
-        after, before = decision.fast, decision.fast._replace(layer_changes=memory.fast.layer_changes)
-        choice, keys = jax.random.categorical(key, decision.logits), jax.random.split(key, ENVS)
-        agent, _ = ACTING.step(agent, choice, KNOWLEDGE, LONG, policy=policy, decision=decision, reset_keys=keys)
-        full = (after.num_decisions % WINDOW == 0) & (after.num_decisions <= 4 * WINDOW)
-        return agent, (full, loss(before), loss(after))
+        pathways = policy.pathways(AGENT_LOOP.policy_inputs(agent, KNOWLEDGE, LONG_PARAMS), memory)
+        decision = policy.decide(pathways, memory)
+        # The window after the decision, with the changes before and after the inner step.
+        fast_after = decision.fast
+        fast_before = fast_after._replace(layer_changes=memory.fast.layer_changes)
+        has_adapted = (fast_after.num_decisions % WINDOW == 0) & (fast_after.num_decisions <= 4 * WINDOW)
 
-    agent = ACTING.start(jax.random.key(0), ENVS, policy.initial_memory((ENVS,)), KNOWLEDGE, LONG)
-    return jax.lax.scan(step, agent, jax.random.split(jax.random.key(1), steps))[1]
+        choice = jax.random.categorical(key, decision.logits)
+        reset_keys = jax.random.split(key, ENVS)
+        agent, _ = AGENT_LOOP.step(
+            agent, choice, KNOWLEDGE, LONG_PARAMS, policy=policy, decision=decision, reset_keys=reset_keys
+        )
+        return agent, (has_adapted, window_loss(fast_before), window_loss(fast_after))
+
+    agent = AGENT_LOOP.start(jax.random.key(0), ENVS, policy.initial_memory((ENVS,)), KNOWLEDGE, LONG_PARAMS)
+    return jax.lax.scan(act, agent, jax.random.split(jax.random.key(1), num_steps))[1]
 
 
 @pytest.mark.exhaustive
-def test_training_teaches_the_loss_and_its_steps_make_it_fall():
-    learner = Learner(ACTING, PPOConfig(num_envs=ENVS, rollout=10, epochs=2, minibatches=2), "none")
-    begin = jax.jit(learner.init)(jax.random.key(0), LONG, KNOWLEDGE)
+def test_training_teaches_the_loss_and_inner_steps_make_it_fall():
+    learner = Learner(AGENT_LOOP, PPOConfig(num_envs=ENVS, rollout=10, epochs=2, minibatches=2), "none")
+    initial_state = jax.jit(learner.init)(jax.random.key(0), LONG_PARAMS, KNOWLEDGE)
     train = jax.jit(functools.partial(learner.train, num_updates=20))
-    after, _ = train(begin, learner.config.scalars(40), LONG, KNOWLEDGE)
-    loss_before, loss_after = (state.params["method"]["learned_loss"] for state in (begin, after))
-    moved = jax.tree.map(lambda a, b: float(np.abs(a - b).max()), loss_before, loss_after)
-    assert min(jax.tree.leaves(moved)) > 1e-3
-    full, before, now = map(np.asarray, fall(after.params, 60))
-    assert full.sum() > 100
-    assert (now < before)[full].mean() >= 0.9
-    np.testing.assert_array_equal(now[~full], before[~full])
+    trained_state, _ = train(initial_state, learner.config.scalars(40), LONG_PARAMS, KNOWLEDGE)
+
+    # Every parameter of the loss has learned.
+    initial_loss = initial_state.params["method"]["learned_loss"]
+    trained_loss = trained_state.params["method"]["learned_loss"]
+    distances = jax.tree.map(lambda before, after: float(np.abs(after - before).max()), initial_loss, trained_loss)
+    assert min(jax.tree.leaves(distances)) > 1e-3
+
+    # Nine in ten inner steps make the loss fall, and without one it stays.
+    has_adapted, loss_before, loss_after = map(np.asarray, losses_around_inner_steps(trained_state.params, 60))
+    assert has_adapted.sum() > 100
+    assert (loss_after < loss_before)[has_adapted].mean() >= 0.9
+    np.testing.assert_array_equal(loss_after[~has_adapted], loss_before[~has_adapted])
 
 
 @pytest.mark.exhaustive
