@@ -109,7 +109,7 @@ class Clusters(NamedTuple):
 
     weights: np.ndarray
     scale: np.ndarray
-    degrees_of_freedom: int
+    degrees_of_freedom: float
 
 
 def mean_interval(values: np.ndarray, scenes: Clusters, *, trained: bool = True) -> Interval:
@@ -139,15 +139,15 @@ def paired_difference(
     Both sides share the scenes, so that the difficulty of a scene cancels.
 
     Args:
-      reference: bool, int or float [S, E], finite.
-      compared: the same shape; sides that were trained separately may differ in S.
+      reference: bool, int or float [S1, E], finite.
+      compared: [S2, E]; S2 must be S1 with `same_runs`, and for fixed policies.
       scenes: clusters of the E episodes.
       same_runs: True if row s of both sides is the same network (sTDE against no removal). Otherwise, the two sides
         were trained separately: `std` is sqrt(std_reference^2 + std_compared^2), and there are no `seeds`.
       trained: True to generalize to other training runs; False for the interval of these policies in other scenes.
 
     Raises:
-      InputError: see `mean_interval`; or the shapes of `reference` and `compared` differ.
+      InputError: see `mean_interval`; or the shapes differ with `same_runs`, or without `trained`.
     """
     # With fixed policies, or with the same networks, the differences themselves are results [S, E].
     if not trained or same_runs:
@@ -162,10 +162,34 @@ def paired_difference(
     runs_by_side = np.array([len(reference), len(compared)])
     num_runs = runs_by_side.sum()
     runs = leave_one_out(np.arange(num_runs), np.repeat([0, 1], runs_by_side))
+    if len(reference) != len(compared):
+        runs = runs._replace(degrees_of_freedom=_welch_degrees(reference.mean(axis=1), compared.mean(axis=1)))
     signed_results = np.concatenate([-reference * (num_runs / len(reference)), compared * (num_runs / len(compared))])
     replicates = runs.weights.T @ signed_results @ scenes.weights / signed_results.size
     combined_std = math.hypot(_std(reference.mean(axis=1)), _std(compared.mean(axis=1)))
     return jackknife_interval(replicates, scenes, runs, std=combined_std)
+
+
+def _welch_degrees(first_means: np.ndarray, second_means: np.ndarray) -> float:
+    """Degrees of freedom of the difference between two sides with different numbers of runs (Welch, 1947).
+
+    Pooled degrees would count on the quiet side of many runs for the variance of the other. With equal numbers of runs,
+    pooled degrees are robust to different variances.
+
+    Args:
+      first_means, second_means: mean of each run, [S1] and [S2].
+
+    Returns:
+      At least the degrees of the smaller side; 0 if a side has a single run, which shows no variance.
+    """
+    if min(len(first_means), len(second_means)) < 2:
+        return 0.0
+    first_variance = first_means.var(ddof=1) / len(first_means)
+    second_variance = second_means.var(ddof=1) / len(second_means)
+    if first_variance + second_variance == 0.0:
+        return float(len(first_means) + len(second_means) - 2)
+    squares = first_variance**2 / (len(first_means) - 1) + second_variance**2 / (len(second_means) - 1)
+    return float((first_variance + second_variance) ** 2 / squares)
 
 
 def interquartile_mean(values: np.ndarray, scenes: Clusters, *, trained: bool = True) -> Interval:

@@ -236,14 +236,18 @@ def _check_folds(config: ExperimentConfig) -> None:
 
 
 def _check_seeds(runs: list[AgentRun]) -> None:
-    """Check that agents that are compared with the random actions of others have as many seeds."""
+    """Check that agents that are compared with an untrained variant of others have as many seeds."""
+    from jaxnav.evaluation.report import UNTRAINED_VARIANTS
+
     seeds = {(run.world, run.agent): run.config.seeds for run in runs}
     for run in runs:
         for reference in run.against:
             agent, _, variant = reference.partition("/")
-            if variant == "random" and seeds.get((run.world, agent), run.config.seeds) != run.config.seeds:
+            num_seeds = seeds.get((run.world, agent), run.config.seeds)
+            if variant in UNTRAINED_VARIANTS and num_seeds != run.config.seeds:
                 raise InputError(
-                    f"{run.name}: has other seeds than {agent}, with whose random actions it is compared; give as many"
+                    f"{run.name}: has {run.config.seeds} seeds, and {agent}, with whose variant {variant} it is "
+                    f"compared, has {num_seeds}; give equally many seeds"
                 )
 
 

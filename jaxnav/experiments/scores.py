@@ -331,18 +331,19 @@ def measure_groups(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
         if not members or not references:
             continue
 
-        # The effect varies with the networks of both sides, unless they are the same or the reference has none. Agents
-        # may differ in their number of training runs; a group has as many as each of its agents.
+        # The effect varies with the networks of both sides, unless they are the same or the reference has none. A group
+        # uses the first S runs of each agent, S being the fewest runs of an agent.
         compared = [member[variant] for member in members]
         clusters = compared[0].episodes.clusters()
         is_untrained = agent_variant in UNTRAINED_VARIANTS
         same_networks = not agent and "baseline" not in (variant, reference)
-        num_runs = min(len(scores.metrics["sr"]) for scores in (*compared, *references))
+        same_runs = is_untrained or same_networks
+        num_compared = min(len(scores.metrics["sr"]) for scores in compared)
+        num_references = min(len(scores.metrics["sr"]) for scores in references)
+        if same_runs:
+            num_compared = num_references = min(num_compared, num_references)
         effect = paired_difference(
-            _mean_sr(references, num_runs),
-            _mean_sr(compared, num_runs),
-            clusters,
-            same_runs=is_untrained or same_networks,
+            _mean_sr(references, num_references), _mean_sr(compared, num_compared), clusters, same_runs=same_runs
         )
         fields = {"world": run.world, "run": name, "variant": variant, "decoding": "argmax", "shift": shift}
         yield ResultRow(**fields, reference=reference, metric="sr", value=effect)

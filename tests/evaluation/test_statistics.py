@@ -169,13 +169,20 @@ def test_difference_of_separate_runs_adds_their_variances():
 
 
 def test_difference_of_separate_runs_allows_different_numbers_of_runs():
-    # Scenes alike; run means 0, 2 and 1, 5, 9: means 1 and 5, variances 2 / 2 and 16 / 3, and 1 + 2 degrees of freedom.
+    # Scenes alike; run means 0, 2 and 1, 5, 9: means 1 and 5, variances 2 / 2 and 16 / 3. Welch's degrees of freedom:
+    # (1 + 16/3)^2 / (1^2 / 1 + (16/3)^2 / 2) = (361/9) / (137/9) = 361/137.
     first_values = np.repeat([[0.0], [2.0]], 6, axis=1)
     last_values = np.repeat([[1.0], [5.0], [9.0]], 6, axis=1)
     gain = paired_difference(first_values, last_values, scenes_of(6))
     assert gain.mean == pytest.approx(4)
     assert gain.std == pytest.approx(math.sqrt(2 + 16))
-    assert half_width(gain) == pytest.approx(t.ppf(0.975, 3) * math.sqrt(2 / 2 + 16 / 3))
+    assert half_width(gain) == pytest.approx(t.ppf(0.975, 361 / 137) * math.sqrt(2 / 2 + 16 / 3))
+
+    # A single run on one side shows no variance.
+    assert not paired_difference(first_values[:1], last_values, scenes_of(6)).has_bounds
+
+    # Equal runs on both sides have no variance at all.
+    assert half_width(paired_difference(0 * first_values, 0 * last_values, scenes_of(6))) == 0
 
     # The same networks, or fixed policies, are paired run by run.
     for fixed_settings in ({"same_runs": True}, {"trained": False}):
