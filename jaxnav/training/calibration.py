@@ -326,10 +326,10 @@ def _measure_gaps(
 
 
 def limit_walks(num_walks: int, num_features: int, num_categories: int) -> int:
-    """Number of walks whose examples fit into 2 GiB; the usual number up to about 80 categories.
+    """Number of walks whose examples fit into 2 GiB.
 
-    The examples are float32, two for each walk: features of all pairs in both layouts. The whole regression takes about
-    twice as much memory.
+    The examples are float32, two for each walk: features of all pairs in both layouts. The usual numbers of walks fit
+    up to 81 categories with the features of `surprise`, and up to 256 with that of `learned`.
 
     Args:
       num_walks: number of walks that is wanted.
@@ -337,7 +337,7 @@ def limit_walks(num_walks: int, num_features: int, num_categories: int) -> int:
       num_categories: K.
 
     Returns:
-      At least 1, and at most `num_walks`.
+      At most `num_walks`, and at least 1 even where one does not fit.
     """
     num_pairs = num_categories * (num_categories - 1) // 2
     bytes_per_walk = 2 * 4 * num_features * num_pairs

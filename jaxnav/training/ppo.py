@@ -459,7 +459,7 @@ def replay_rollout(policy: Policy, transitions: Transition, memory: PolicyState,
 def _replay_in_parallel(
     policy: Policy, pathways: Pathways, transitions: Transition, memory: PolicyState
 ) -> tuple[Decision, Decision]:
-    """Apply inputs and heads for all T steps in parallel; only the GRU, and what reads its memory, runs step by step.
+    """Apply inputs and heads for all T steps in parallel; the GRU, and experience that reads its state, step by step.
 
     Returns:
       Factual and counterfactual decisions, leaves [T, B, ...].
@@ -473,9 +473,11 @@ def _replay_in_parallel(
 
     # Factual: unroll the GRU through time. `policy.decide` is not called here, so the experience is masked by hand.
     if policy.method.reads_memory:
-        unrolled_core = _unroll_with_attention(policy, pathways, direct_input, previous_action, transitions, memory)
-        # The counterfactual branch reads the same experience, but no gradient of it enters the factual memory.
-        memory_before = memory._replace(hidden=unrolled_core.hidden_before, action=previous_action)
+        unrolled_core = _unroll_with_attention(
+            policy, pathways, direct_input, previous_action, transitions, memory.hidden
+        )
+        # Experience of all steps at once, from constant memories: for the counterfactual branch and the heads.
+        memory_before = PolicyState(hidden=unrolled_core.hidden_before, action=previous_action)
         pathways = mask_experience(policy.attend(pathways, memory_before), transitions.use_experience)
         mediated_input = policy.mediated_input(pathways, previous_action)
     else:
@@ -507,28 +509,28 @@ def _unroll_with_attention(
     direct_input: jax.Array,
     previous_action: jax.Array,
     transitions: Transition,
-    memory: PolicyState,
+    hidden: jax.Array,
 ) -> UnrolledGRU:
     """Unroll the GRU of a policy whose experience attends from the recurrent state.
 
     Args:
       policy: policy whose method reads the memory.
       pathways: outputs of `policy.encode`, leaves [T, B, ...].
-      direct_input: float32 [T, B, H], the projected direct pathways.
+      direct_input: float32 [T, B, H], the projected direct pathways; [T, B, 2 H] with two streams, as all states.
       previous_action: int32 [T, B].
       transitions: leaves [T, B, ...].
-      memory: memories before the first step, leaves [B, ...].
+      hidden: float32 [B, H], recurrent state before the first step.
 
     Returns:
       The states along the rollout, with gradients as those of `unroll_gru`.
     """
 
     def step(hidden_before: jax.Array, inputs: Any) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        encoded, direct_input, previous_action, use_experience, ended = inputs
+        encoded, direct, action, use_experience, ended = inputs
         # The experience attends from the state before the step, then the GRU advances.
-        memory_before = memory._replace(hidden=hidden_before, action=previous_action)
+        memory_before = PolicyState(hidden=hidden_before, action=action)
         attended = mask_experience(policy.attend(encoded, memory_before), use_experience)
-        input_gates = policy.input_gates(direct_input + policy.mediated_input(attended, previous_action))
+        input_gates = policy.input_gates(direct + policy.mediated_input(attended, action))
         hidden_after = gru_step(input_gates, policy.hidden_gates(hidden_before), hidden_before)
 
         # An ended episode starts again from zeros.
@@ -536,7 +538,7 @@ def _unroll_with_attention(
         return next_hidden, (hidden_after, hidden_before)
 
     scan_inputs = pathways, direct_input, previous_action, transitions.use_experience, transitions.ended
-    _, (hidden_after, hidden_before) = jax.lax.scan(step, memory.hidden, scan_inputs)
+    _, (hidden_after, hidden_before) = jax.lax.scan(step, hidden, scan_inputs)
     hidden_before = jax.lax.stop_gradient(hidden_before)
     return UnrolledGRU(hidden_after, hidden_before, policy.hidden_gates(hidden_before))
 

@@ -160,13 +160,17 @@ def test_both_kinds_of_replay_agree_in_decisions_and_gradients(method_name, kind
                 decisions = replay_as(replay_decisions, agent_loop, weights, rollout)
                 return distil_loss(decisions), [decision.logits for decision in decisions]
 
-            return jax.grad(loss, has_aux=True)(weights)
+            def factual_loss(weights):
+                factual, _ = replay_as(replay_decisions, agent_loop, weights, rollout)
+                return jnp.square(factual.logits).mean() + jnp.square(factual.value).mean()
+
+            return *jax.grad(loss, has_aux=True)(weights), jax.grad(factual_loss)(weights)
 
         results.append(compute(weights))
     chex.assert_trees_all_close(*results, rtol=1e-3, atol=1e-5)
 
     # Distillation reaches nothing that only the direct pathways use.
-    gradient, _ = results[0]
+    gradient, *_ = results[0]
     reached = changed_parts(jax.tree.map(jnp.zeros_like, gradient), gradient)
     assert reached >= {"method", "core", "actor", "fuse"}
     assert not reached & {"view", "sought", "critic"}
