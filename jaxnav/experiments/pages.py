@@ -17,6 +17,7 @@ import jinja2.meta
 import jinja2.nodes
 
 from jaxnav.errors import InputError
+from jaxnav.evaluation.notes import MIN_OTHER_CATEGORIES_SHARE
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.experiments.bench import best_epsilon
 from jaxnav.experiments.config import AgentRun, ExperimentConfig, agent_runs, join_folds
@@ -126,6 +127,7 @@ def _load_template(template: str) -> jinja2.Template:
     )
     environment.filters |= {"f": format_value, "plus_minus": format_with_std}
     environment.globals |= {
+        "min_other_categories_share": MIN_OTHER_CATEGORIES_SHARE,
         "line": table_line,
         "header": table_header,
         "verdict": verdict,
