@@ -430,7 +430,7 @@ def _std(means: np.ndarray) -> float:
     return float(means.std(ddof=1)) if len(means) > 1 else math.nan
 
 
-def _satterthwaite_degrees(variance: float, parts: tuple[float, ...], degrees: tuple[int, ...]) -> float:
+def _satterthwaite_degrees(variance: float, parts: tuple[float, ...], degrees: tuple[float, ...]) -> float:
     """Approximate the degrees of freedom of a sum of variances."""
     # (sum of variances)^2 / sum of (variance^2 / its degrees of freedom), never below the fewest.
     spread_sum = sum(
