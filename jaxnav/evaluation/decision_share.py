@@ -262,7 +262,7 @@ def share_interval(counted: np.ndarray, weighted_decisions: np.ndarray, scenes: 
       The share over all runs, with that of every run in `seeds`; NaN without decisions.
     """
     # Numerator and denominator leave out the same run and the same scene.
-    runs = run_clusters(1, len(weighted_decisions))
+    runs = run_clusters(len(weighted_decisions))
     counted_replicates = runs.weights.T @ counted @ scenes.weights
     decision_replicates = runs.weights.T @ weighted_decisions @ scenes.weights
     if not weighted_decisions.any():

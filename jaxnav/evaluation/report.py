@@ -504,7 +504,7 @@ def remaining_share(
 
     # Replicates leave out one run (of either agent, if they were trained separately), and one scene; numerator and
     # denominator leave out the same.
-    runs = run_clusters(1 if same_runs else 2, len(agent))
+    runs = run_clusters(len(agent)) if same_runs else run_clusters(len(agent), len(agent))
 
     def lead_replicates(results: np.ndarray) -> np.ndarray:
         both_results = -np.asarray(layout_blind, np.float64), np.asarray(results, np.float64)

@@ -159,9 +159,8 @@ def paired_difference(
     # scaled by the number of runs over those of its side, so that both sides count as much.
     reference = _as_finite_results("reference", reference, scenes)
     compared = _as_finite_results("compared", compared, scenes)
-    runs_by_side = np.array([len(reference), len(compared)])
-    num_runs = runs_by_side.sum()
-    runs = leave_one_out(np.arange(num_runs), np.repeat([0, 1], runs_by_side))
+    num_runs = len(reference) + len(compared)
+    runs = run_clusters(len(reference), len(compared))
     if len(reference) != len(compared):
         runs = runs._replace(degrees_of_freedom=_welch_degrees(reference.mean(axis=1), compared.mean(axis=1)))
     signed_results = np.concatenate([-reference * (num_runs / len(reference)), compared * (num_runs / len(compared))])
@@ -223,7 +222,7 @@ def interquartile_mean(values: np.ndarray, scenes: Clusters, *, trained: bool = 
         return float(plan_means.ravel()[order] @ inner_weights / inner_weights.sum())
 
     # Leave out one run, one floor plan, or both.
-    runs = run_clusters(1, num_runs)
+    runs = run_clusters(num_runs)
     replicates = np.empty((runs.weights.shape[1], 1 + num_plans))
     for run_column in range(replicates.shape[0]):
         for plan_column in range(1 + num_plans):
@@ -262,10 +261,10 @@ def probability_of_improvement(
     scene_weights = _cluster_weights(scenes)
     if same_runs:
         own_pairs = is_better[np.arange(num_runs), np.arange(num_runs)]  # [S, C]
-        runs = run_clusters(1, num_runs)
+        runs = run_clusters(num_runs)
         replicates = runs.weights.T @ own_pairs @ scene_weights / (num_runs * num_plans)
     else:
-        runs = run_clusters(2, num_runs)
+        runs = run_clusters(num_runs, num_runs)
         reference_weights = runs.weights[:num_runs]
         compared_weights = runs.weights[num_runs:]
         weighted_sums = np.einsum(
@@ -337,9 +336,9 @@ def scene_clusters(plans: np.ndarray, rooms: np.ndarray, counts: np.ndarray | No
     return leave_one_out(plans, None if fewest_plans < 2 else rooms, counts)
 
 
-def run_clusters(arms: int, seeds: int) -> Clusters:
-    """Cluster items [arms * seeds] by training run, within arms."""
-    return leave_one_out(np.arange(arms * seeds), np.repeat(np.arange(arms), seeds))
+def run_clusters(*runs_by_arm: int) -> Clusters:
+    """Cluster items by training run, within arms; each argument is the number of runs of an arm."""
+    return leave_one_out(np.arange(sum(runs_by_arm)), np.repeat(np.arange(len(runs_by_arm)), runs_by_arm))
 
 
 def leave_one_out(labels: np.ndarray, strata: np.ndarray | None = None, counts: np.ndarray | None = None) -> Clusters:
@@ -393,7 +392,7 @@ def _cluster_weights(scenes: Clusters) -> np.ndarray:
 
 def _mean_over_runs(values: np.ndarray, scenes: Clusters) -> Interval:
     """Compute the mean of results [S, E] whose rows are training runs of one arm."""
-    runs = run_clusters(1, len(values))
+    runs = run_clusters(len(values))
     replicates = runs.weights.T @ values @ scenes.weights / values.size
     run_means = values.mean(axis=1)
     return jackknife_interval(replicates, scenes, runs, std=_std(run_means), seeds=tuple(run_means.tolist()))
@@ -475,9 +474,7 @@ class SharedDesign(NamedTuple):
         all_names = tuple(sorted(room_by_name))
         scene_plans = np.array(list(map(floor_plan_name, all_names)))
         scene_rooms = np.array([room_by_name[name] for name in all_names])
-        return cls(
-            all_names, scene_plans, scene_rooms, scene_clusters(scene_plans, scene_rooms), run_clusters(1, seeds)
-        )
+        return cls(all_names, scene_plans, scene_rooms, scene_clusters(scene_plans, scene_rooms), run_clusters(seeds))
 
     def jackknife_means(
         self, sums: np.ndarray, weights: np.ndarray, names: Sequence[str], *, trained: bool = True

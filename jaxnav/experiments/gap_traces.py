@@ -441,7 +441,7 @@ def _statistic_by_step(statistic: Callable[..., np.ndarray], sides: list[GapTrac
       sides: traces of equal policies, estimators and number of steps.
     """
     # A floor plan that occurs on both sides is left out of both at once.
-    runs = run_clusters(1, len(sides[0].running))
+    runs = run_clusters(len(sides[0].running))
     scene_clusters_by_side = joint_clusters([side.episodes for side in sides])
     replicate_shape = (runs.weights.shape[1], scene_clusters_by_side[0].weights.shape[1])
 

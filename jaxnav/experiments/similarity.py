@@ -118,7 +118,7 @@ def relate_success_to_similarity(points: SimilarityPoints, success: np.ndarray) 
     """
     # Leave-one-out weights of the points, and their success without each run.
     scenes = points.episodes.clusters()
-    runs = run_clusters(1, len(success))
+    runs = run_clusters(len(success))
     weights = points.member @ scenes.weights  # [P, 1 + C]
     success_rates = points.means(success.T @ runs.weights / len(success))  # [P, 1 + R]
 
@@ -153,7 +153,7 @@ def relate_gain_to_similarity(
     """
     # Both arms were trained separately, so a replicate leaves out one run of either arm.
     scenes = points.episodes.clusters()
-    runs = run_clusters(2, len(baseline))
+    runs = run_clusters(len(baseline), len(baseline))
 
     # Points are averaged by category, weighted by their episodes.
     weights = points.member @ scenes.weights  # [P, 1 + C]

@@ -95,7 +95,7 @@ class LayoutConfig:
         type of the room, or one `pooled` over all rooms.
       walks: number of random walks in the training scenes before training, at least 1. They count which things are seen
         together, and so make the prior (the first belief) of the layout estimator. The layout gap `learned` (see
-        `jaxnav list settings`) learns from four times as many walks.
+        `jaxnav list settings`) learns from four times as many walks, with more than 256 categories from fewer.
       steps: number of steps of each random walk, at least 1.
     """
 

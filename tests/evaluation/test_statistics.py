@@ -268,7 +268,7 @@ def test_episode_bootstrap_has_too_low_coverage():
 
 
 def test_run_clusters_leave_runs_out_within_their_arm():
-    runs = run_clusters(2, 3)
+    runs = run_clusters(3, 3)
     assert runs.degrees_of_freedom == 4
     np.testing.assert_allclose(runs.weights[:, 1], [0, 1.5, 1.5, 1, 1, 1])
 
