@@ -468,8 +468,9 @@ def _replay_in_parallel(
     next_previous_action = jnp.where(transitions.ended, NO_ACTION, transitions.action)
     previous_action = jnp.concatenate([memory.action[None], next_previous_action[:-1]])
 
-    # Mask the direct pathways as while acting.
-    direct_input = policy.direct_input(mask_direct_pathways(pathways, transitions.use_direct))
+    # Mask the direct pathways as while acting; experience does not read them.
+    pathways = mask_direct_pathways(pathways, transitions.use_direct)
+    direct_input = policy.direct_input(pathways)
 
     # Factual: unroll the GRU through time. `policy.decide` is not called here, so the experience is masked by hand.
     if policy.method.reads_memory:
@@ -485,8 +486,7 @@ def _replay_in_parallel(
         mediated_input = policy.mediated_input(pathways, previous_action)
         factual_gates = policy.input_gates(direct_input + mediated_input)
         unrolled_core = unroll_gru(policy.recurrent_kernel, factual_gates, transitions.ended, memory.hidden)
-    factual_pathways = mask_direct_pathways(pathways, transitions.use_direct)
-    factual_decision = policy.apply_heads(unrolled_core.hidden_after, factual_pathways)
+    factual_decision = policy.apply_heads(unrolled_core.hidden_after, pathways)
 
     # Counterfactual: the mediated input only.
     counterfactual_pathways = do(pathways, scene=0.0, goal=0.0)
