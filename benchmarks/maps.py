@@ -27,7 +27,7 @@ from jaxnav.numerics.trees import tree_where
 from jaxnav.policies.agent_loop import AgentLoop
 from jaxnav.policies.method import Knowledge
 from jaxnav.policies.methods import find_method
-from jaxnav.policies.methods.map_tracker import FREE_BIT, WALL_BIT, draw_view
+from jaxnav.policies.methods.map_tracker import FREE_BIT, WALL_BIT, draw_view, make_view_table
 from jaxnav.policies.methods.semexp import SEMEXP, cell_positions, learn_search_setup
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.policies.wavefront import find_path, pack_board
@@ -36,6 +36,7 @@ from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import CELL_SIZE, Scene
 from jaxnav.scenes.tables.compile import Bank, compile_bank
 from jaxnav.scenes.tables.observation_row import RowFormat
+from jaxnav.scenes.task import HOUSES
 from jaxnav.scenes.worlds import WORLDS, make_generated_scenes
 
 #: Updates or plans in a timed call.
@@ -56,13 +57,14 @@ def measure_costs(size: int = 64) -> dict[str, Any]:
     # Random observations and a random map.
     rng = np.random.default_rng(0)
     row_format = RowFormat(22)
+    view_table = make_view_table(HOUSES.rules, row_format.view)
     row = jnp.asarray(rng.integers(0, 256, row_format.num_bytes, np.uint8))
     passable = pack_board(jnp.asarray(rng.random((size, size)) < 0.7))
     target = pack_board(jnp.zeros((size, size), bool).at[3, 3].set(True))
 
     # Positions change from call to call, so that the loop cannot be simplified.
     def update_map(i: jax.Array, cells: jax.Array) -> jax.Array:
-        return draw_view(cells, row, jnp.array([30, 30]) + i % 5, i % 12, row_format, 12)
+        return draw_view(cells, row, jnp.array([30, 30]) + i % 5, i % 12, row_format, view_table)
 
     def plan(i: jax.Array, total_length: jax.Array) -> jax.Array:
         return total_length + find_path(target, passable, jnp.array([20, 20]) + i % 20).length

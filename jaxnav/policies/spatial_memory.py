@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnav.scenes.tables.observation_row import VIEW_BLOCKED, VIEW_FREE, RowFormat
-from jaxnav.scenes.task import Rules
+from jaxnav.scenes.task import FrontCell, Rules
 
 #: State of a map cell. Where views disagree, the larger number wins.
 UNKNOWN, BLOCKED, FREE, VISITED = range(4)
@@ -46,12 +46,14 @@ class SpatialMemory:
       size: N, cells along each side of the map.
       reach: number of cells that are read on each side of the agent.
       stride: distance in cells between neighbouring cells that are read.
+      front_cell: cell next to the agent that a view shows, see `Rules.front_cell`.
     """
 
     headings: int
     size: int = 64
     reach: int = 5
     stride: int = 2
+    front_cell: FrontCell = "nearest"
 
     def init(self) -> ExplorationMap:
         """Return an empty map with the agent at its centre."""
@@ -134,7 +136,7 @@ class SpatialMemory:
 
     @property
     def _rules(self) -> Rules:
-        return Rules(headings=self.headings)
+        return Rules(headings=self.headings, front_cell=self.front_cell)
 
     def _cells_at(self, offsets: np.ndarray, position: jax.Array, heading: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return rows and columns of the cells at offsets [H, M, 2] from the agent, by its heading."""

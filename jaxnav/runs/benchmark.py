@@ -34,6 +34,7 @@ from jaxnav.runs.results import Results
 from jaxnav.runs.subjects import AgentSubject, PolicySubject, find_subject
 from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world, draw_episode_lists
 from jaxnav.scenes.tables.compile import bank_checksum
+from jaxnav.scenes.task import FrontCell
 from jaxnav.store.files import write_atomic
 
 #: Benchmarks by name.
@@ -88,6 +89,7 @@ class Benchmark:
       shifts: layout shifts.
       shift_by: categories that exchange their places, see `jaxnav.evaluate`.
       tracks: the tracks.
+      front_cell: cell next to the agent that a view shows, see `Rules.front_cell`; `v1` is from before this setting.
     """
 
     name: str
@@ -98,6 +100,7 @@ class Benchmark:
     shifts: tuple[float, ...]
     shift_by: ShiftKind
     tracks: tuple[Track, ...]
+    front_cell: FrontCell = "nearest"
 
 
 def load_benchmark(name: str) -> Benchmark:
@@ -248,7 +251,7 @@ def score_label(row: dict[str, Any]) -> str:
 
 def compile_track(benchmark: Benchmark, track: Track, shift: float, console: Console) -> CompiledWorld:
     """Compile the homes of a track at a layout shift."""
-    worlds = WorldConfig(seed=benchmark.scene_seed, goals=track.goals)
+    worlds = WorldConfig(seed=benchmark.scene_seed, goals=track.goals, front_cell=benchmark.front_cell)
     worlds = dataclasses.replace(worlds, **{f"num_{benchmark.split}": track.num_scenes})
     config = RunConfig(world=track.world, worlds=worlds)
     return compile_evaluation_world(config, benchmark.split, None, shift, console, shift_by=benchmark.shift_by)

@@ -14,7 +14,7 @@ from jaxnav.choices import CounterfactualMemory, Counts, Reduction
 from jaxnav.errors import InputError
 from jaxnav.policies.spec import DecisionKind, Direct, PolicySpec, Sizes, WeightKind
 from jaxnav.scenes.tables.observation_row import Detector
-from jaxnav.scenes.task import NUM_ACTIONS, Task
+from jaxnav.scenes.task import NUM_ACTIONS, FrontCell, Task
 from jaxnav.scenes.worlds import WORLDS
 from jaxnav.store.files import expand_home
 from jaxnav.training.config import CounterfactualTraining, PPOConfig, stage_index_at
@@ -50,6 +50,9 @@ class WorldConfig:
         the episode.
       near_starts: probability, from 0 to 1, that a training episode starts near its goal: in the nearest of eight
         random cells.
+      front_cell: cell that a view shows next to the agent: the one to which MoveAhead leads (`move`), or the one
+        `nearest` to the point a cell's length along the heading, as in runs from before this setting. In rooms, with
+        eight headings, both are the same.
       shard_scenes: number of scenes in a shard, a part of the scenes that is loaded at once, at least 1. With more
         scenes than this, all are compiled to disk (`cache`), and training takes the shards in turn. Smaller shards need
         less memory.
@@ -68,6 +71,7 @@ class WorldConfig:
     large_step_limit: int | None = None
     shaping: float | None = None
     near_starts: float | None = None
+    front_cell: FrontCell | None = None
     shard_scenes: int = 128
 
 
@@ -230,8 +234,14 @@ class RunConfig:
             task = dataclasses.replace(task, categories=self.worlds.categories, goals=())
 
         goals = task.goals if self.worlds.goals is None else self.worlds.goals
-        instance_counts = self.layout_counts == "instances"
-        return dataclasses.replace(task, goals=goals, detector=self.detector, instance_counts=instance_counts)
+        front_cell = self.worlds.front_cell or task.rules.front_cell
+        return dataclasses.replace(
+            task,
+            goals=goals,
+            rules=dataclasses.replace(task.rules, front_cell=front_cell),
+            detector=self.detector,
+            instance_counts=self.layout_counts == "instances",
+        )
 
     @property
     def layout_counts(self) -> Counts:
@@ -243,6 +253,7 @@ class RunConfig:
         """Specification from which the run's policies are built."""
         from jaxnav.policies.spatial_memory import SpatialMemory
 
+        rules = self.task.rules
         return PolicySpec(
             method=self.policy_method,
             num_categories=num_categories,
@@ -250,7 +261,7 @@ class RunConfig:
             method_sizes=tuple(sorted(self.method_sizes.items())),
             direct=self.direct or usual_direct(self.policy_method),
             done_gate=self.done_gate,
-            spatial_memory=SpatialMemory(self.task.rules.headings) if self.spatial_memory else None,
+            spatial_memory=SpatialMemory(rules.headings, front_cell=rules.front_cell) if self.spatial_memory else None,
             decision=self.decision,
             goal_row=self.goal_row,
             weight_kind=self.layout.weights,
@@ -379,6 +390,7 @@ def fill_world_defaults(config: RunConfig) -> RunConfig:
         "large_step_limit": world.large_step_limit,
         "shaping": world.shaping,
         "near_starts": world.near_starts,
+        "front_cell": task.rules.front_cell,
     }
 
     # Settings that are given stay.

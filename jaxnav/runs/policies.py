@@ -659,7 +659,7 @@ def config_for_task(task: Task, method: str, arm: str) -> RunConfig | None:
             arms=(arm,),
             seeds=1,
             layout=layout,
-            worlds=WorldConfig(goals=goals),
+            worlds=WorldConfig(goals=goals, front_cell=task.rules.front_cell),
             detector=task.detector,
         )
         if config.task == task:

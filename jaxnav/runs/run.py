@@ -38,6 +38,7 @@ TIMES_FILE = "times.jsonl"
 REACH_FILE = "reach.json"
 #: Settings that runs of earlier versions lack, with the values that they were trained with.
 _EARLIER_SETTINGS: dict[str, dict[str, Any]] = {
+    "worlds": {"front_cell": "nearest"},
     "layout": {"counts": "presence", "weights": "raw"},
     "ppo": {"guidance": 0.0, "final_guidance": None},
 }
@@ -109,6 +110,7 @@ def comparable_settings(config: RunConfig) -> dict[str, Any]:
     Results of earlier versions are recognized by these settings.
     """
     settings = run_settings(config)
+    settings["worlds"]["front_cell"] = config.task.rules.front_cell  # by default that of the world
     for group_name, earlier_values in _EARLIER_SETTINGS.items():
         for name, earlier_value in earlier_values.items():
             if settings[group_name][name] == earlier_value:

@@ -28,6 +28,10 @@ MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT, LOOK_UP, LOOK_DOWN, DONE = range(NUM_ACTI
 NEIGHBOURS = np.array([(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)])
 
 
+#: Cell that a view shows next to the agent, see `Rules.front_cell`.
+FrontCell = Literal["move", "nearest"]
+
+
 @dataclasses.dataclass(frozen=True)
 class Rules:
     """Rules of motion, view and success.
@@ -37,6 +41,9 @@ class Rules:
       horizons: camera pitches, degrees downwards; every episode starts with the first.
       field_of_view: horizontal and vertical, degrees.
       camera: height above the floor, metres.
+      front_cell: cell that the view shows next to the agent, in the middle of its row 1. `move`: the cell to which
+        MoveAhead leads, so that the agent can see if it is free. `nearest`: the one nearest to the point a cell's
+        length along the heading, as in files from before this setting. With 4 or 8 headings, both are the same.
       success: condition for Done to succeed: `seen`, a visible goal object whose centre is within the success distance
         horizontally; or `near`, a goal object whose footprint is within the success distance on foot.
       success_distance: metres.
@@ -46,6 +53,7 @@ class Rules:
     horizons: tuple[float, ...] = (0.0, 30.0)
     field_of_view: tuple[float, float] = (100.0, 100.0)
     camera: float = 1.5
+    front_cell: FrontCell = "nearest"
     success: Literal["seen", "near"] = "seen"
     success_distance: float = 1.5
 
@@ -93,7 +101,10 @@ class Rules:
         Returns:
           int [H, V, V, 2], (dz, dx) from the agent's cell, by heading; row 0 nearest to the agent, column 0 leftmost.
         """
-        return self.offsets_by_heading(np.arange(view), np.arange(view) - view // 2)
+        offsets = self.offsets_by_heading(np.arange(view), np.arange(view) - view // 2)
+        if self.front_cell == "move":
+            offsets[:, 1, view // 2] = self.move_steps()
+        return offsets
 
     def offsets_by_heading(self, ahead: np.ndarray, right: np.ndarray) -> np.ndarray:
         """Return cells ahead and to the right of the agent.
@@ -168,10 +179,20 @@ def _lists_to_tuples(values: Mapping[str, Any]) -> dict[str, Any]:
 #: The tasks of AI2-THOR rooms, RoboTHOR apartments and Gibson houses.
 ROOMS = Task()
 APARTMENTS = Task(
-    ROBOTHOR_CATEGORIES, ROBOTHOR_GOALS, Rules(headings=12, field_of_view=(79.0, 63.5), success_distance=1.0)
+    ROBOTHOR_CATEGORIES,
+    ROBOTHOR_GOALS,
+    Rules(headings=12, field_of_view=(79.0, 63.5), front_cell="move", success_distance=1.0),
 )
 HOUSES = Task(
     GIBSON_CATEGORIES,
     GIBSON_GOALS,
-    Rules(headings=12, horizons=(0.0,), field_of_view=(79.0, 63.5), camera=0.88, success="near", success_distance=1.0),
+    Rules(
+        headings=12,
+        horizons=(0.0,),
+        field_of_view=(79.0, 63.5),
+        camera=0.88,
+        front_cell="move",
+        success="near",
+        success_distance=1.0,
+    ),
 )

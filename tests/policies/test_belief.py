@@ -56,6 +56,7 @@ from jaxnav.policies.methods.map_tracker import (
     NUM_LOOK_DISTANCES,
     WALL_BIT,
     MapTracker,
+    make_view_table,
     nearest_looks,
 )
 from jaxnav.policies.network import bind, init_params
@@ -63,11 +64,12 @@ from jaxnav.policies.spec import PolicySpec
 from jaxnav.policies.testing import check_method
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.tables.observation_row import PERFECT_DETECTOR, VIEW_BLOCKED, VIEW_FREE, VIEW_UNKNOWN, RowFormat
-from jaxnav.scenes.task import Task
+from jaxnav.scenes.task import Rules, Task
 
 NUM_CATEGORIES = len(CATEGORIES)
 SPECS = {method: PolicySpec(method, NUM_CATEGORIES) for method in (BELIEF, DIRICHLET)}
 ROWS = RowFormat(NUM_CATEGORIES)
+VIEW_TABLE = make_view_table(Rules(headings=8), ROWS.view)
 #: Squares along each side of a small map; a map has 2 x 2 cells in each.
 NUM_SQUARES = 20
 ENV, PARAMS = tiny.world()
@@ -153,7 +155,7 @@ def test_a_view_looks_at_its_squares_from_the_nearest_cell():
     view = np.full((1, ROWS.view, ROWS.view), VIEW_UNKNOWN, np.uint8)
     view[0, [1, 2, 4], ROWS.view // 2] = VIEW_FREE, VIEW_FREE, VIEW_BLOCKED
     row = jnp.asarray(ROWS.pack(np.zeros((1, NUM_CATEGORIES, 4), np.uint8), view)[0])
-    distance_bin = np.asarray(nearest_looks(row, jnp.array([8, 8], jnp.int32), jnp.int32(0), ROWS, 8, 32))
+    distance_bin = np.asarray(nearest_looks(row, jnp.array([8, 8], jnp.int32), jnp.int32(0), ROWS, VIEW_TABLE, 32))
     # Cells (9, 8), 0.25 m, and (10, 8), 0.5 m, are in squares (4, 4) and (5, 4); (12, 8), 1 m, is in square (6, 4).
     expected = np.full((16, 16), NUM_LOOK_DISTANCES)
     expected[[4, 5, 6], 4] = 0, 1, 2

@@ -8,17 +8,27 @@ import numpy as np
 import pytest
 from support.scenes import BOOK, CATEGORIES, CHAIR, FRIDGE
 
-from jaxnav.policies.methods.map_tracker import EXPLORED_BIT, FREE_BIT, VISITED_BIT, WALL_BIT, draw_view, mark_collision
+from jaxnav.policies.methods.map_tracker import (
+    EXPLORED_BIT,
+    FREE_BIT,
+    VISITED_BIT,
+    WALL_BIT,
+    draw_view,
+    learned_view_table,
+    make_view_table,
+    mark_collision,
+)
 from jaxnav.scenes.categories import category_ids
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import CELL_SIZE
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.tables.observation_row import PERFECT_DETECTOR, VIEW_BLOCKED, VIEW_FREE, VIEW_UNKNOWN, RowFormat
-from jaxnav.scenes.task import MOVE_AHEAD, ROTATE_RIGHT, Task
+from jaxnav.scenes.task import MOVE_AHEAD, ROTATE_RIGHT, Rules, Task
 from jaxnav.scenes.worlds import WORLDS, make_generated_scenes
 
-EMPTY, ROWS, HEADINGS = jnp.zeros((32, 32), jnp.uint32), RowFormat(len(CATEGORIES)), 8
-update = jax.jit(functools.partial(draw_view, row_format=ROWS, headings=HEADINGS))
+EMPTY, ROWS = jnp.zeros((32, 32), jnp.uint32), RowFormat(len(CATEGORIES))
+VIEW_TABLE = make_view_table(Rules(headings=8), ROWS.view)
+update = jax.jit(functools.partial(draw_view, row_format=ROWS, view_table=VIEW_TABLE))
 START = 16
 
 
@@ -98,6 +108,15 @@ def test_what_the_agent_runs_into_is_a_wall():
         np.testing.assert_array_equal(bump(free, ahead, jnp.int32(action), jnp.bool_(moved)), free)
 
 
+def test_the_cells_of_a_view_are_those_of_the_training_homes():
+    """Exports without the entry come from before views showed the cell of MoveAhead."""
+    nearest, move = (Rules(headings=12, front_cell=front_cell) for front_cell in ("nearest", "move"))
+    steps = {"steps": np.zeros((12, 2), np.int32)}
+    for setup, rules in [({}, nearest), ({"shows_next_cell": False}, nearest), ({"shows_next_cell": True}, move)]:
+        table = learned_view_table(steps | setup, ROWS.view)
+        jax.tree.map(np.testing.assert_array_equal, table, make_view_table(rules, ROWS.view))
+
+
 @pytest.mark.parametrize("world", ["rooms", "apartments", "houses"])
 def test_maps_of_random_walks_agree_with_the_home(world):
     """With a detector without errors every mark is where an object of its category stands."""
@@ -105,7 +124,8 @@ def test_maps_of_random_walks_agree_with_the_home(world):
     scene = make_generated_scenes(world, "train", 1)[0]
     bank = compile_bank([scene], Task(task.categories, task.goals, task.rules, PERFECT_DETECTOR))
     rules, rows = task.rules, RowFormat(len(task.categories))
-    take_in = jax.jit(functools.partial(draw_view, row_format=rows, headings=rules.headings))
+    view_table = make_view_table(rules, rows.view)
+    take_in = jax.jit(functools.partial(draw_view, row_format=rows, view_table=view_table))
     places, generator = standable_cells(scene.reach), np.random.default_rng(0)
     pose, cells, been = len(bank.rows) // 2, jnp.zeros((96, 96), jnp.uint32), set()
     for _ in range(400):

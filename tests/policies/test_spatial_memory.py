@@ -32,7 +32,7 @@ def walked(request):
     task = WORLDS[request.param].task
     scene = make_generated_scenes(request.param, "train", 1)[0]
     env, params = build_environment(compile_bank([scene], task), {}, 10**6)
-    memory = SpatialMemory(task.rules.headings)
+    memory = SpatialMemory(task.rules.headings, front_cell=task.rules.front_cell)
     acting = AgentLoop(env, dataclasses.replace(tiny.SPEC, num_categories=len(task.categories), spatial_memory=memory))
 
     @jax.jit

@@ -33,6 +33,7 @@ APARTMENTS = Rules(
     horizons=(0.0, 30.0),
     field_of_view=(79.0, 63.5),
     camera=1.5,
+    front_cell="move",
     success="seen",
     success_distance=1.0,
 )
@@ -41,6 +42,7 @@ HOUSES = Rules(
     horizons=(0.0,),
     field_of_view=(79.0, 63.5),
     camera=0.88,
+    front_cell="move",
     success="near",
     success_distance=1.0,
 )

@@ -79,6 +79,9 @@ def view_lines(rules: Rules, heading: int) -> list[tuple[Cell, set[Cell]] | None
             # Rounded twice, for 2.4999999999999996 is a half, too.
             dz = round(round(ahead * math.cos(yaw) - right * math.sin(yaw), 9))
             dx = round(round(ahead * math.sin(yaw) + right * math.cos(yaw), 9))
+            # The cell in front is the one to which MoveAhead leads.
+            if (ahead, right) == (1, 0) and rules.front_cell == "move":
+                dz, dx = neighbour(rules, heading)
             on_line = {(round(Fraction(dz * k, 22)), round(Fraction(dx * k, 22))) for k in range(1, 22)}
             view.append(((dz, dx), on_line - {(0, 0), (dz, dx)}))
     return view

@@ -1,5 +1,6 @@
 """The twin by hand: moves, endings, measures and the view."""
 
+import dataclasses
 import math
 
 import pytest
@@ -225,12 +226,16 @@ def cells_straight_ahead(episode):
 
 def test_view_at_30_degrees_rounds_to_cells():
     # Half of it is 0.824 cells a step. Heading 1 of 12, f = (1/2, 0.866): 3 steps ahead are (x, z) = (1.5, 2.6), the
-    # cell [3, 2], for 1.5 is rounded to 2; 1 step is [1, 0], for 0.5 is rounded to 0.
+    # cell [3, 2], for 1.5 is rounded to 2. In front is [1, 1], where MoveAhead leads.
     rows = ["." * 13 for _ in range(13)]
     rows[3] = "..#.........."
-    rows[1] = "#............"
+    rows[1] = ".#..........."
     episode = start_twin(draw(rows), heading=1, rules=APARTMENTS)
     assert cells_straight_ahead(episode)[:4] == ".#.#"
+
+    # The nearest cell in front is the free [1, 0], for 0.5 is rounded to 0.
+    nearest_rules = dataclasses.replace(APARTMENTS, front_cell="nearest")
+    assert cells_straight_ahead(start_twin(draw(rows), heading=1, rules=nearest_rules))[:4] == "...#"
 
     # 4 steps are (2, 3.46), [3, 2] again; 3 to the left of it, at (2 - 2.60, 3.46 + 1.5), the lattice has ended.
     expected_rows = ["??#..#...??", "???..#..???", "????...????", "?????#?????", "?????.?????"]

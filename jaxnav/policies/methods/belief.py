@@ -58,6 +58,7 @@ from jaxnav.policies.methods.map_tracker import (
     SQUARE_CELLS,
     MapTracker,
     SearchState,
+    learned_view_table,
     nearest_looks,
 )
 from jaxnav.policies.methods.semexp import learn_search_setup, required_map_sizes
@@ -114,13 +115,13 @@ class BeliefTracker(MapTracker):
     def update(self, state: SearchState, knowledge: Knowledge, percept: Percept) -> SearchState:
         """Draw a view on the map and count the looks."""
         next_state = super().update(state, knowledge, percept)
-        headings = len(knowledge.method["steps"])
         row_format = RowFormat(knowledge.layout.shape[-1])
+        view_table = learned_view_table(knowledge.method, row_format.view)
 
         # After a collision the view is the previous one, whose detections are no new evidence.
         is_new_view = (percept.action != MOVE_AHEAD) | percept.moved
         distance_bin = nearest_looks(
-            percept.row, next_state.position, percept.heading, row_format, headings, len(state.cells)
+            percept.row, next_state.position, percept.heading, row_format, view_table, len(state.cells)
         )
         look_bins = np.arange(NUM_LOOK_DISTANCES, dtype=np.int32)[:, None, None]
         assert state.looks is not None

@@ -24,6 +24,7 @@ from jaxnav.policies.methods.map_tracker import (
     SQUARE_CELLS,
     SearchState,
     detection_cells,
+    make_view_table,
     nearest_looks,
 )
 from jaxnav.policies.methods.semexp import cell_positions
@@ -268,21 +269,22 @@ def count_looks(
       search: state of the search after the view.
       row: uint8 [R], the observation row.
       squares, categories: int32 [M, 2] and int32 [M], the home's objects.
-      agent_loop: has the format of the rows and the headings.
+      agent_loop: has the format of the rows and the rules.
     """
     row_format = agent_loop.env.row_format
     num_categories = row_format.num_categories
-    headings = agent_loop.env.task.rules.headings
+    rules = agent_loop.env.task.rules
     size = len(search.cells)
-    view = (row, search.position, search.heading, row_format, headings, size)
+    view = (row, search.position, search.heading, row_format)
 
     # Distance bin of the nearest object of each category in view, [K].
-    distance_bins = nearest_looks(*view)[squares[:, 0], squares[:, 1]]
+    view_table = make_view_table(rules, row_format.view)
+    distance_bins = nearest_looks(*view, view_table, size)[squares[:, 0], squares[:, 1]]
     unseen = jnp.full(num_categories + 1, NUM_LOOK_DISTANCES, jnp.int32)
     nearest_bin = unseen.at[categories].min(distance_bins)[:num_categories]
 
     # A hit is a detection in the object's square or in a neighbouring one.
-    detected_squares = detection_cells(*view) // SQUARE_CELLS
+    detected_squares = detection_cells(*view, rules.headings, size) // SQUARE_CELLS
     num_squares = size // SQUARE_CELLS
     own_detection = detected_squares[jnp.minimum(categories, num_categories - 1)]
     separation = jnp.abs((squares - own_detection + num_squares // 2) % num_squares - num_squares // 2).max(axis=-1)

@@ -7,7 +7,8 @@ map block by block for the network.
 
 import dataclasses
 import functools
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -60,8 +61,27 @@ GOAL_CONFIRMED = 2
 # The map
 
 
+class ViewTable(NamedTuple):
+    """Cells of the map that a view shows.
+
+    A view turned by less than a right angle may have two of its cells in one map cell.
+
+    Attributes:
+      offsets: int32 [H, V V, 2], (dz, dx) from the agent, by heading.
+      twins: int32 [H, V V], for each cell of the view its twin in the same map cell; the cell itself if it has none.
+    """
+
+    offsets: Any
+    twins: Any
+
+
 def draw_view(
-    cells: jax.Array, row: jax.Array, position: jax.Array, heading: jax.Array, row_format: RowFormat, headings: int
+    cells: jax.Array,
+    row: jax.Array,
+    position: jax.Array,
+    heading: jax.Array,
+    row_format: RowFormat,
+    view_table: ViewTable,
 ) -> jax.Array:
     """Draw a view on the map of one episode, and return the map uint32 [N, N].
 
@@ -74,15 +94,13 @@ def draw_view(
       position: int32 [2], (z, x) of the agent's cell.
       heading: int32 [], compass heading.
       row_format: format of the observation row.
-      headings: H, number of headings of the task.
+      view_table: cells of the view, by heading.
     """
     # Map cells [V V] of the view. Two cells of the view may share a map cell, whose state they then share.
     size = len(cells)
-    offset_table, twin_table = _view_tables(headings, row_format.view)
-    near_table = CELL_SIZE * np.hypot(*np.moveaxis(offset_table, -1, 0)) <= MIN_RANGE
-    offsets = jnp.asarray(offset_table)[heading]
-    twins = jnp.asarray(twin_table)[heading]
-    is_near = jnp.asarray(near_table)[heading]
+    offsets = jnp.asarray(view_table.offsets)[heading]
+    twins = jnp.asarray(view_table.twins)[heading]
+    is_near = CELL_SIZE * jnp.hypot(*jnp.moveaxis(offsets, -1, 0)) <= MIN_RANGE
     rows, columns = ((position[None] + offsets) % size).T
     view = row_format.view_cells(row)
     view = jnp.maximum(view, view[twins])
@@ -106,7 +124,7 @@ def draw_view(
     cells = cells.at[own_row, own_column].set(own_word)
 
     # Adding the missing bits is a bitwise or.
-    rows, columns = detection_cells(row, position, heading, row_format, headings, size).T
+    rows, columns = detection_cells(row, position, heading, row_format, len(view_table.offsets), size).T
     return cells.at[rows, columns].add(detected_bits & ~cells[rows, columns])
 
 
@@ -116,7 +134,8 @@ def detection_cells(
     """Return the map cell int32 [K, 2] of each category's detection; without a detection it is meaningless.
 
     Args:
-      row, position, heading, row_format, headings: as in `draw_view`.
+      row, position, heading, row_format: as in `draw_view`.
+      headings: H, number of headings of the task.
       size: N, cells along each side of the map.
     """
     # Metres ahead and to the right of the agent, [K].
@@ -131,24 +150,24 @@ def detection_cells(
 
 
 def nearest_looks(
-    row: jax.Array, position: jax.Array, heading: jax.Array, row_format: RowFormat, headings: int, size: int
+    row: jax.Array, position: jax.Array, heading: jax.Array, row_format: RowFormat, view_table: ViewTable, size: int
 ) -> jax.Array:
     """Return the distance bin from which a view shows each square, int32 [N / 2, N / 2].
 
     Squares that the view does not show have the bin `NUM_LOOK_DISTANCES`. Of a square's cells the nearest one counts.
 
     Args:
-      row, position, heading, row_format, headings: as in `draw_view`.
+      row, position, heading, row_format, view_table: as in `draw_view`.
       size: N, cells along each side of the map.
     """
     # Squares and distance bins of the cells of the view, [V V].
-    offset_table, _ = _view_tables(headings, row_format.view)
-    distance_table = CELL_SIZE * np.hypot(*np.moveaxis(offset_table, -1, 0))
-    bin_table = np.minimum(distance_table / LOOK_SPACING, NUM_LOOK_DISTANCES - 1).astype(np.int32)
-    rows, columns = ((position[None] + jnp.asarray(offset_table)[heading]) % size // SQUARE_CELLS).T
+    offsets = jnp.asarray(view_table.offsets)[heading]
+    distances = CELL_SIZE * jnp.hypot(*jnp.moveaxis(offsets, -1, 0))
+    seen_bins = jnp.minimum(distances / LOOK_SPACING, NUM_LOOK_DISTANCES - 1).astype(jnp.int32)
+    rows, columns = ((position[None] + offsets) % size // SQUARE_CELLS).T
     view = row_format.view_cells(row)
     is_seen = (view == VIEW_FREE) | (view == VIEW_BLOCKED)
-    distance_bins = jnp.where(is_seen, jnp.asarray(bin_table)[heading], NUM_LOOK_DISTANCES)
+    distance_bins = jnp.where(is_seen, seen_bins, NUM_LOOK_DISTANCES)
 
     num_squares = size // SQUARE_CELLS
     unseen = jnp.full((num_squares, num_squares), NUM_LOOK_DISTANCES, jnp.int32)
@@ -189,16 +208,9 @@ def category_bit(category: jax.Array) -> jax.Array:
 
 
 @functools.lru_cache
-def _view_tables(headings: int, view: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the map offsets of the cells of a view, by heading, and which cells of the view share a map cell.
-
-    A view turned by less than a right angle may have two of its cells in one map cell.
-
-    Returns:
-      Offsets (dz, dx) from the agent, int32 [H, V V, 2]; and for each cell of the view its twin in the same map cell,
-      int32 [H, V V], which is the cell itself if it has none.
-    """
-    offsets = Rules(headings=headings).view_offsets(view).reshape(headings, -1, 2).astype(np.int32)
+def make_view_table(rules: Rules, view: int) -> ViewTable:
+    """Return the cells of a view of V x V cells, by heading, as NumPy arrays."""
+    offsets = rules.view_offsets(view).reshape(rules.headings, -1, 2).astype(np.int32)
     is_same_cell = (offsets[:, :, None] == offsets[:, None]).all(axis=-1)
     num_cells = is_same_cell.shape[-1]
 
@@ -206,7 +218,22 @@ def _view_tables(headings: int, view: int) -> tuple[np.ndarray, np.ndarray]:
     first_twin = is_same_cell.argmax(axis=-1)
     last_twin = num_cells - 1 - is_same_cell[..., ::-1].argmax(axis=-1)
     twins = np.where(first_twin == np.arange(num_cells), last_twin, first_twin)
-    return offsets, twins.astype(np.int32)
+    return ViewTable(offsets, twins.astype(np.int32))
+
+
+def learned_view_table(setup: Mapping[str, jax.Array], view: int) -> ViewTable:
+    """Return the cells of a view under the rules of the training homes.
+
+    Args:
+      setup: what SemExp learned before training; `shows_next_cell` is missing in earlier exports.
+      view: V, cells along each side of a view.
+    """
+    headings = len(setup["steps"])
+    earlier_table = make_view_table(Rules(headings=headings, front_cell="nearest"), view)
+    if "shows_next_cell" not in setup:
+        return earlier_table
+    table = make_view_table(Rules(headings=headings, front_cell="move"), view)
+    return jax.tree.map(functools.partial(jnp.where, setup["shows_next_cell"]), table, earlier_table)
 
 
 # The tracker
@@ -304,7 +331,8 @@ class MapTracker:
         confirmed_sight = jnp.where(is_new_view, goal_sight, jnp.minimum(goal_sight, state.goal_sight))
 
         # Draw the view, the collision and a cleared goal on the map.
-        cells = draw_view(state.cells, percept.row, position, percept.heading, row_format, len(strides))
+        view_table = learned_view_table(knowledge.method, row_format.view)
+        cells = draw_view(state.cells, percept.row, position, percept.heading, row_format, view_table)
         cells = mark_collision(cells, position + stride, percept.action, percept.moved)
         cells = _clear_goal_once(state.cells, cells, position, percept.goal)
 

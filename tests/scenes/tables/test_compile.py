@@ -10,8 +10,9 @@ from jaxnav.errors import InputError
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.tables.compile import compile_bank, compile_scene, concatenate_banks
-from jaxnav.scenes.tables.observation_row import PERFECT_DETECTOR, RowFormat
-from jaxnav.scenes.task import Task
+from jaxnav.scenes.tables.observation_row import PERFECT_DETECTOR, VIEW_BLOCKED, VIEW_FREE, RowFormat
+from jaxnav.scenes.task import MOVE_AHEAD, Task
+from jaxnav.scenes.worlds import WORLDS, make_generated_scenes
 
 ROW_FORMAT = RowFormat(len(CATEGORIES))
 BOOK_AHEAD = ("Book", 0, 1.5, 2, *SMALL)
@@ -104,6 +105,22 @@ def test_ego_centric_view_of_a_mirrored_room_is_mirrored(rules):
             assert mirrored_picture == [row[::-1] for row in picture]
             opposite_heading = (heading + rules.headings // 2) % rules.headings
             assert view_picture(turned_scene, (8 - iz, 8 - ix), opposite_heading, rules) == picture
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_the_cell_in_front_shows_whether_move_ahead_moves(world):
+    """With twelve headings, the cell nearest to the heading is another one, often free where the move is blocked."""
+    scene = make_generated_scenes(world, "train", 1)[0]
+    task = WORLDS[world].task
+    is_correct = {}
+    for front_cell in ("nearest", "move"):
+        rules = dataclasses.replace(task.rules, front_cell=front_cell)
+        bank = compile_bank([scene], dataclasses.replace(task, rules=rules))
+        moves = bank.successor[:, MOVE_AHEAD] != np.arange(len(bank.rows))
+        front_state = task.row_format.view_cells(bank.rows).reshape(-1, 11, 11)[:, 1, 5]
+        is_correct[front_cell] = front_state == np.where(moves, VIEW_FREE, VIEW_BLOCKED)
+    assert is_correct["move"].all()
+    assert is_correct["nearest"].all() == (task.rules.headings == 8)
 
 
 # Banks
