@@ -119,10 +119,12 @@ def prepare_game(config: PlayConfig, console: Console) -> Game:
     policy = config.policy
     adviser = None
     layout_config = LayoutConfig()
+    front_cell = None
     if policy is not None:
         policy_config = config_for_policy(policy)
         policy_world = policy_config.world
         layout_config = policy_config.layout
+        front_cell = policy_config.worlds.front_cell
         adviser = load_policy(policy)
         method = adviser.spec.method
         if policy_world != config.world:
@@ -131,7 +133,8 @@ def prepare_game(config: PlayConfig, console: Console) -> Game:
             raise InputError(f"--policy {policy}: method {method.name!r} does not choose actions; give another policy")
 
     # The game takes one episode of the list that an evaluation with this seed would play.
-    run_config = RunConfig(world=config.world, worlds=WorldConfig(seed=config.seed), layout=layout_config)
+    worlds = WorldConfig(seed=config.seed, front_cell=front_cell)
+    run_config = RunConfig(world=config.world, worlds=worlds, layout=layout_config)
     world = compile_evaluation_world(
         run_config, config.split, config.scenes, config.shift, console, shift_by=config.shift_by
     )

@@ -46,7 +46,7 @@ class SpatialMemory:
       size: N, cells along each side of the map.
       reach: number of cells that are read on each side of the agent.
       stride: distance in cells between neighbouring cells that are read.
-      front_cell: cell next to the agent that a view shows, see `Rules.front_cell`.
+      front_cell: cell in front of the agent that a view shows, see `Rules.front_cell`; that of the task.
     """
 
     headings: int

@@ -89,7 +89,7 @@ class Benchmark:
       shifts: layout shifts.
       shift_by: categories that exchange their places, see `jaxnav.evaluate`.
       tracks: the tracks.
-      front_cell: cell next to the agent that a view shows, see `Rules.front_cell`; `v1` is from before this setting.
+      front_cell: cell in front of the agent that a view shows, see `Rules.front_cell`; None for that of each world.
     """
 
     name: str
@@ -100,7 +100,7 @@ class Benchmark:
     shifts: tuple[float, ...]
     shift_by: ShiftKind
     tracks: tuple[Track, ...]
-    front_cell: FrontCell = "nearest"
+    front_cell: FrontCell | None = None
 
 
 def load_benchmark(name: str) -> Benchmark:

@@ -50,9 +50,9 @@ class WorldConfig:
         the episode.
       near_starts: probability, from 0 to 1, that a training episode starts near its goal: in the nearest of eight
         random cells.
-      front_cell: cell that a view shows next to the agent: the one to which MoveAhead leads (`move`), or the one
-        `nearest` to the point a cell's length along the heading, as in runs from before this setting. In rooms, with
-        eight headings, both are the same.
+      front_cell: cell in front of the agent that a view shows: the one that MoveAhead leads to (`move`, usual in
+        apartments and houses), or the one `nearest` to the point a cell's length along the heading, as in runs from
+        before this setting. In rooms both are the same.
       shard_scenes: number of scenes in a shard, a part of the scenes that is loaded at once, at least 1. With more
         scenes than this, all are compiled to disk (`cache`), and training takes the shards in turn. Smaller shards need
         less memory.

@@ -118,7 +118,8 @@ def _make_program_export(policy: LoadedPolicy, run: Run) -> Export:
         "runs with JAX and flatbuffers",
         NAMES_FILE: "names by index, and the digest",
     }
-    inputs_text = _INPUTS_TEXT.format(choices=policy.spec.method.control.num_choices)
+    num_choices = policy.spec.method.control.num_choices
+    inputs_text = _INPUTS_TEXT.format(choices=num_choices, front_cell=_FRONT_CELL_TEXT[policy.task.rules.front_cell])
     usage = (*_code_block(_CALLING_CODE), *inputs_text.rstrip().split("\n"))
     return Export(files, descriptions, usage)
 
@@ -152,13 +153,18 @@ outputs = step.call(inputs, np.float32(0.5))  # epsilon
 inputs |= {"memory": outputs["memory"], "action": outputs["action"], "first": np.zeros(8, bool)}
 """
 
+_FRONT_CELL_TEXT = {
+    "move": "the cell that MoveAhead leads to",
+    "nearest": "the cell nearest to the point 0.25 m along the heading",
+}
+
 _INPUTS_TEXT = f"""
 Inputs, a row for each episode:
 
 * `detections` uint8 [K, 4]: for each category, by the nearest object of it, confidence x 255 (0: not detected), metres
   ahead x {AHEAD_SCALE:g}, metres to the right x {RIGHT_SCALE:g} + 128, apparent size x {SIZE_SCALE:g}
 * `view` uint8 [V, V]: cells of 0.25 m before the agent, 0 unknown, 1 free, 2 blocked; row 0 is nearest, column 0
-  leftmost
+  leftmost; the middle of row 1 is {{front_cell}}
 * `goal`, `action`, `heading`, `horizon`, `room` int32: category of the goal, previous action, compass heading, horizon
   of the camera, type of the room (which selects the layout prior)
 * `moved` bool: true where the previous action changed the cell; `first` bool: true where an episode begins

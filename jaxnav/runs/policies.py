@@ -243,8 +243,17 @@ class Policies(NamedTuple):
         """Agent loop of these policies in the scenes of a world.
 
         Raises:
-          InputError: the method cannot act in these scenes.
+          InputError: the scenes are compiled for other rules, or the method cannot act in them.
         """
+        rule_differences = list_differences(
+            dataclasses.asdict(self.task.rules), dataclasses.asdict(world.env.task.rules)
+        )
+        if rule_differences:
+            raise InputError(
+                f"the policies were trained under other rules than those of the scenes (policy != scenes): "
+                f"{'; '.join(rule_differences)}; train with the rules of the scenes, such as by --worlds.front-cell"
+            )
+
         # Some methods refuse scenes, such as those that are larger than their map.
         world.check_method(self.spec.method, self.knowledge)
         return AgentLoop(
@@ -648,7 +657,7 @@ def config_for_task(task: Task, method: str, arm: str) -> RunConfig | None:
       method: name of its method.
       arm: `baseline` or `layout`.
     """
-    # Rules and categories identify a generated world; goals and detector may differ from its defaults.
+    # Rules and categories identify a generated world; goals, detector and front cell may differ from its defaults.
     layout = LayoutConfig(counts="instances" if task.instance_counts else "presence")
     for name, world in WORLDS.items():
         goals = None if world.task.goals == task.goals else task.goals

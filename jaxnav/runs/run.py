@@ -104,13 +104,24 @@ def run_settings(config: RunConfig) -> dict[str, Any]:
     return setting_fields
 
 
+def manifest_settings(config: RunConfig) -> dict[str, Any]:
+    """Settings for the manifests of a run: those in its directory, or those of a new run.
+
+    An earlier version may have written the directory. `claim_run_dir` checks that its settings mean the same.
+    """
+    path = config.run_dir / CONFIG_FILE
+    if not path.exists():
+        return run_settings(config)
+    return read_json_with_digest(path, "restore the file or train in another --run-dir")
+
+
 def comparable_settings(config: RunConfig) -> dict[str, Any]:
     """Settings that identify a run, without those that stand for the behaviour of versions that lack them.
 
     Results of earlier versions are recognized by these settings.
     """
     settings = run_settings(config)
-    settings["worlds"]["front_cell"] = config.task.rules.front_cell  # by default that of the world
+    settings["worlds"]["front_cell"] = config.task.rules.front_cell  # None in an unchecked configuration
     for group_name, earlier_values in _EARLIER_SETTINGS.items():
         for name, earlier_value in earlier_values.items():
             if settings[group_name][name] == earlier_value:

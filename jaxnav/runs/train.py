@@ -51,7 +51,17 @@ from jaxnav.runs.preparation import (
     load_preparation,
     save_preparation,
 )
-from jaxnav.runs.run import LOG_FILE, REACH_FILE, TIMES_FILE, Run, RunLogs, claim_run_dir, lock_run_dir, run_settings
+from jaxnav.runs.run import (
+    LOG_FILE,
+    REACH_FILE,
+    TIMES_FILE,
+    Run,
+    RunLogs,
+    claim_run_dir,
+    lock_run_dir,
+    manifest_settings,
+    run_settings,
+)
 from jaxnav.runs.validation import SCORE_METRIC, Validator
 from jaxnav.runs.worlds import (
     CompiledWorld,
@@ -165,7 +175,7 @@ def train_points(
     if list(points) != [config]:
         ppo_settings = [run_settings(point)["ppo"] for point in points]
         manifest_fields["points"] = {name: [settings[name] for settings in ppo_settings] for name in ppo_settings[0]}
-    manifest = make_manifest(run_settings(config) | manifest_fields)
+    manifest = make_manifest(manifest_settings(config) | manifest_fields)
     check_agreement(json.dumps(manifest))
 
     with lock_run_dir(config) as lock:

@@ -28,7 +28,7 @@ MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT, LOOK_UP, LOOK_DOWN, DONE = range(NUM_ACTI
 NEIGHBOURS = np.array([(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)])
 
 
-#: Cell that a view shows next to the agent, see `Rules.front_cell`.
+#: Cell in front of the agent that a view shows, see `Rules.front_cell`.
 FrontCell = Literal["move", "nearest"]
 
 
@@ -41,9 +41,9 @@ class Rules:
       horizons: camera pitches, degrees downwards; every episode starts with the first.
       field_of_view: horizontal and vertical, degrees.
       camera: height above the floor, metres.
-      front_cell: cell that the view shows next to the agent, in the middle of its row 1. `move`: the cell to which
-        MoveAhead leads, so that the agent can see if it is free. `nearest`: the one nearest to the point a cell's
-        length along the heading, as in files from before this setting. With 4 or 8 headings, both are the same.
+      front_cell: cell that the middle of the view's row 1 shows. `move`: the cell that MoveAhead leads to, so that the
+        agent can see if it is free. `nearest`: the one nearest to the point a cell's length along the heading, as in
+        files from before this setting. With 4 or 8 headings, both are the same; other tasks should have `move`.
       success: condition for Done to succeed: `seen`, a visible goal object whose centre is within the success distance
         horizontally; or `near`, a goal object whose footprint is within the success distance on foot.
       success_distance: metres.

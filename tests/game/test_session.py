@@ -17,7 +17,9 @@ from jaxnav.game.config import PlayConfig
 from jaxnav.game.session import KEY_ACTIONS, Game, choose_episode, play_game, prepare_game
 from jaxnav.layout import LayoutEstimator
 from jaxnav.runs.policy import LoadedPolicy
+from jaxnav.scenes.files.scene_file import write_scenes
 from jaxnav.scenes.task import NUM_ACTIONS
+from jaxnav.scenes.worlds import make_generated_scenes
 
 EPSILON = 0.1
 WORLD = tiny.compiled_world()
@@ -178,3 +180,12 @@ def test_choose_episode_refuses_invalid_options(goal, seed, problem):
 def test_prepare_game_refuses_a_policy_of_another_world():
     with pytest.raises(InputError, match=r"--policy rooms-org: .*; play with --world rooms"):
         prepare_game(PlayConfig("houses", policy="rooms-org"), Console(quiet=True))
+
+
+def test_a_game_has_the_views_that_its_policy_was_trained_with(tmp_path):
+    """`houses-org` is of an earlier version, and houses of today have other views."""
+    scenes = tmp_path / "scenes.jsonl.gz"
+    write_scenes(scenes, make_generated_scenes("houses", "val", 1))
+    game = prepare_game(PlayConfig("houses", scenes=scenes, policy="houses-org"), Console(quiet=True))
+    assert game.world.env.task.rules == game.policy.task.rules
+    assert game.world.env.task.rules.front_cell == "nearest"

@@ -18,6 +18,7 @@ from jaxnav.policies.methods.map_tracker import (
     make_view_table,
     mark_collision,
 )
+from jaxnav.policies.methods.semexp import learn_search_setup
 from jaxnav.scenes.categories import category_ids
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import CELL_SIZE
@@ -112,7 +113,7 @@ def test_the_cells_of_a_view_are_those_of_the_training_homes():
     """Exports without the entry come from before views showed the cell of MoveAhead."""
     nearest, move = (Rules(headings=12, front_cell=front_cell) for front_cell in ("nearest", "move"))
     steps = {"steps": np.zeros((12, 2), np.int32)}
-    for setup, rules in [({}, nearest), ({"shows_next_cell": False}, nearest), ({"shows_next_cell": True}, move)]:
+    for setup, rules in [({}, nearest), ({"front_cell_is_move": False}, nearest), ({"front_cell_is_move": True}, move)]:
         table = learned_view_table(steps | setup, ROWS.view)
         jax.tree.map(np.testing.assert_array_equal, table, make_view_table(rules, ROWS.view))
 
@@ -124,7 +125,7 @@ def test_maps_of_random_walks_agree_with_the_home(world):
     scene = make_generated_scenes(world, "train", 1)[0]
     bank = compile_bank([scene], Task(task.categories, task.goals, task.rules, PERFECT_DETECTOR))
     rules, rows = task.rules, RowFormat(len(task.categories))
-    view_table = make_view_table(rules, rows.view)
+    view_table = learned_view_table(learn_search_setup([bank], np.zeros(0)), rows.view)
     take_in = jax.jit(functools.partial(draw_view, row_format=rows, view_table=view_table))
     places, generator = standable_cells(scene.reach), np.random.default_rng(0)
     pose, cells, been = len(bank.rows) // 2, jnp.zeros((96, 96), jnp.uint32), set()

@@ -125,7 +125,7 @@ def record_readings(memory, walk):
 def endless_readings(memory, walk):
     """Readings of a map without edges, whose cells are forgotten where they leave the window; by cell (z, x)."""
     headings, is_move, view_rows = walk
-    rules = Rules(headings=memory.headings)
+    rules = Rules(headings=memory.headings, front_cell=memory.front_cell)
     view_offsets = rules.view_offsets(WINDOW_ROWS.view).reshape(memory.headings, -1, 2)
     distances = memory.stride * np.arange(-memory.reach, memory.reach + 1)
     read_offsets = rules.offsets_by_heading(distances, distances).reshape(memory.headings, -1, 2)
@@ -150,9 +150,9 @@ def endless_readings(memory, walk):
 
 
 @pytest.mark.parametrize("headings", params_by_tier([4, 8, 12], fast=[12], slow=[4, 8]))
-@pytest.mark.parametrize("turn_prob", [0.0, 0.1])
-def test_a_walk_longer_than_the_map_is_read_as_on_a_map_without_edges(headings, turn_prob):
-    memory = SpatialMemory(headings, size=32)
+@pytest.mark.parametrize(("turn_prob", "front_cell"), [(0.0, "nearest"), (0.1, "nearest"), (0.1, "move")])
+def test_a_walk_longer_than_the_map_is_read_as_on_a_map_without_edges(headings, turn_prob, front_cell):
+    memory = SpatialMemory(headings, size=32, front_cell=front_cell)
     walk = draw_walk(headings, 150, headings, turn_prob)
     _, readings = record_readings(memory, walk)
     np.testing.assert_array_equal(readings, endless_readings(memory, walk))
@@ -221,3 +221,9 @@ def test_a_policy_without_it_has_no_part_of_it():
     assert policy.view.kernel.shape[0] == 2 * policy.row_format.view**2
     assert AgentLoop(ENV, tiny.SPEC).start(jax.random.key(0), 1, None, None, PARAMS).perception.spatial_map is None
     assert jaxnav.RunConfig(spatial_memory=False).policy_spec(22).spatial_memory is None
+
+
+@pytest.mark.parametrize(("world", "front_cell"), [("rooms", "nearest"), ("apartments", "move"), ("houses", "move")])
+def test_the_memory_of_a_run_draws_the_views_of_its_world(world, front_cell):
+    config = jaxnav.RunConfig(world=world)
+    assert config.policy_spec(22).spatial_memory == SpatialMemory(config.task.rules.headings, front_cell=front_cell)

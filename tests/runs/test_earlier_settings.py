@@ -8,9 +8,9 @@ from support.mutations import resigned
 
 import jaxnav
 from jaxnav.errors import InputError
-from jaxnav.runs.config import RunConfig, check_config
+from jaxnav.runs.config import RunConfig, WorldConfig, check_config
 from jaxnav.runs.policies import POLICIES_DIR
-from jaxnav.runs.run import claim_run_dir, load_run_config, run_settings
+from jaxnav.runs.run import claim_run_dir, comparable_settings, load_run_config, manifest_settings, run_settings
 from jaxnav.store.files import write_json_with_digest
 from jaxnav.training.config import PPOConfig
 
@@ -55,6 +55,21 @@ def test_a_fused_run_of_an_earlier_version_has_no_experience_dropout(tmp_path, i
     config = load_run_config(tmp_path / "run")
     assert config.ppo.experience == 1.0
     assert config.counterfactual_memory == "factual"
+
+
+def test_homes_of_an_earlier_version_have_the_earlier_views(tmp_path):
+    """Results from before the setting are recognized by settings without it; the manifest of a run stays as it was."""
+    earlier_config = make_config(world="houses", worlds=WorldConfig(front_cell="nearest"), run_dir=tmp_path / "run")
+    settings = run_settings(earlier_config)
+    del settings["worlds"]["front_cell"]
+    (tmp_path / "run").mkdir()
+    write_json_with_digest(tmp_path / "run" / "config.json", settings)
+    assert load_run_config(tmp_path / "run").task.rules.front_cell == "nearest"
+    assert manifest_settings(earlier_config) == settings
+
+    assert "front_cell" not in comparable_settings(earlier_config)["worlds"]
+    assert comparable_settings(RunConfig(world="houses"))["worlds"]["front_cell"] == "move"
+    assert "front_cell" not in comparable_settings(RunConfig(world="rooms"))["worlds"]
 
 
 def test_a_missing_setting_is_refused(tmp_path):

@@ -23,8 +23,9 @@ from jaxnav.runs.policies import (
     load_policy_as_run,
 )
 from jaxnav.runs.worlds import compile_evaluation_world
+from jaxnav.scenes.files.scene_file import write_scenes
 from jaxnav.scenes.task import Detector, Rules
-from jaxnav.scenes.worlds import WORLDS
+from jaxnav.scenes.worlds import WORLDS, make_generated_scenes
 from jaxnav.viz.episode import play_episode
 
 
@@ -114,3 +115,12 @@ def test_play_episode_refuses_unknown_variants_and_indexes(drawn_run):
         play_episode("rooms-org", variants=("baseline",))
     with pytest.raises(InputError, match="--index 1000: give a number from 0 to 999"):
         play_episode(drawn_run.config.run_dir, index=1000)
+
+
+def test_policies_refuse_scenes_of_other_rules(tmp_path):
+    scenes = tmp_path / "scenes.jsonl.gz"
+    write_scenes(scenes, make_generated_scenes("houses", "val", 1))
+    _, policies = load_policy_as_run("houses-org")
+    world = compile_evaluation_world(jaxnav.RunConfig(world="houses"), "val", scenes, 0.0, Console(quiet=True))
+    with pytest.raises(InputError, match=r"other rules .* front_cell: 'nearest' != 'move'; .* --worlds.front-cell"):
+        policies.make_agent_loop(world)

@@ -68,10 +68,12 @@ class ViewTable(NamedTuple):
 
     Attributes:
       offsets: int32 [H, V V, 2], (dz, dx) from the agent, by heading.
+      distances: float32 [H, V V], metres from the agent.
       twins: int32 [H, V V], for each cell of the view its twin in the same map cell; the cell itself if it has none.
     """
 
     offsets: Any
+    distances: Any
     twins: Any
 
 
@@ -100,7 +102,7 @@ def draw_view(
     size = len(cells)
     offsets = jnp.asarray(view_table.offsets)[heading]
     twins = jnp.asarray(view_table.twins)[heading]
-    is_near = CELL_SIZE * jnp.hypot(*jnp.moveaxis(offsets, -1, 0)) <= MIN_RANGE
+    is_near = jnp.asarray(view_table.distances)[heading] <= MIN_RANGE
     rows, columns = ((position[None] + offsets) % size).T
     view = row_format.view_cells(row)
     view = jnp.maximum(view, view[twins])
@@ -162,7 +164,7 @@ def nearest_looks(
     """
     # Squares and distance bins of the cells of the view, [V V].
     offsets = jnp.asarray(view_table.offsets)[heading]
-    distances = CELL_SIZE * jnp.hypot(*jnp.moveaxis(offsets, -1, 0))
+    distances = jnp.asarray(view_table.distances)[heading]
     seen_bins = jnp.minimum(distances / LOOK_SPACING, NUM_LOOK_DISTANCES - 1).astype(jnp.int32)
     rows, columns = ((position[None] + offsets) % size // SQUARE_CELLS).T
     view = row_format.view_cells(row)
@@ -211,6 +213,7 @@ def category_bit(category: jax.Array) -> jax.Array:
 def make_view_table(rules: Rules, view: int) -> ViewTable:
     """Return the cells of a view of V x V cells, by heading, as NumPy arrays."""
     offsets = rules.view_offsets(view).reshape(rules.headings, -1, 2).astype(np.int32)
+    distances = (CELL_SIZE * np.hypot(offsets[..., 0], offsets[..., 1])).astype(np.float32)
     is_same_cell = (offsets[:, :, None] == offsets[:, None]).all(axis=-1)
     num_cells = is_same_cell.shape[-1]
 
@@ -218,22 +221,22 @@ def make_view_table(rules: Rules, view: int) -> ViewTable:
     first_twin = is_same_cell.argmax(axis=-1)
     last_twin = num_cells - 1 - is_same_cell[..., ::-1].argmax(axis=-1)
     twins = np.where(first_twin == np.arange(num_cells), last_twin, first_twin)
-    return ViewTable(offsets, twins.astype(np.int32))
+    return ViewTable(offsets, distances, twins.astype(np.int32))
 
 
 def learned_view_table(setup: Mapping[str, jax.Array], view: int) -> ViewTable:
     """Return the cells of a view under the rules of the training homes.
 
     Args:
-      setup: what SemExp learned before training; `shows_next_cell` is missing in earlier exports.
+      setup: what SemExp learned before training; `front_cell_is_move` is missing in earlier exports.
       view: V, cells along each side of a view.
     """
     headings = len(setup["steps"])
     earlier_table = make_view_table(Rules(headings=headings, front_cell="nearest"), view)
-    if "shows_next_cell" not in setup:
+    if "front_cell_is_move" not in setup:
         return earlier_table
     table = make_view_table(Rules(headings=headings, front_cell="move"), view)
-    return jax.tree.map(functools.partial(jnp.where, setup["shows_next_cell"]), table, earlier_table)
+    return jax.tree.map(functools.partial(jnp.where, setup["front_cell_is_move"]), table, earlier_table)
 
 
 # The tracker
