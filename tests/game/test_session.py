@@ -185,7 +185,8 @@ def test_prepare_game_refuses_a_policy_of_another_world():
 def test_a_game_has_the_views_that_its_policy_was_trained_with(tmp_path):
     """`houses-org` is of an earlier version, and houses of today have other views."""
     scenes = tmp_path / "scenes.jsonl.gz"
-    write_scenes(scenes, make_generated_scenes("houses", "val", 1))
+    write_scenes(scenes, [make_generated_scenes("houses", "val", 1)[0]])
     game = prepare_game(PlayConfig("houses", scenes=scenes, policy="houses-org"), Console(quiet=True))
+    assert game.policy is not None
     assert game.world.env.task.rules == game.policy.task.rules
     assert game.world.env.task.rules.front_cell == "nearest"

@@ -119,7 +119,7 @@ def test_play_episode_refuses_unknown_variants_and_indexes(drawn_run):
 
 def test_policies_refuse_scenes_of_other_rules(tmp_path):
     scenes = tmp_path / "scenes.jsonl.gz"
-    write_scenes(scenes, make_generated_scenes("houses", "val", 1))
+    write_scenes(scenes, [make_generated_scenes("houses", "val", 1)[0]])
     _, policies = load_policy_as_run("houses-org")
     world = compile_evaluation_world(jaxnav.RunConfig(world="houses"), "val", scenes, 0.0, Console(quiet=True))
     with pytest.raises(InputError, match=r"other rules .* front_cell: 'nearest' != 'move'; .* --worlds.front-cell"):

@@ -224,7 +224,7 @@ def make_view_table(rules: Rules, view: int) -> ViewTable:
     return ViewTable(offsets, distances, twins.astype(np.int32))
 
 
-def learned_view_table(setup: Mapping[str, jax.Array], view: int) -> ViewTable:
+def learned_view_table(setup: Mapping[str, Any], view: int) -> ViewTable:
     """Return the cells of a view under the rules of the training homes.
 
     Args:
