@@ -447,7 +447,9 @@ def check_config(config: RunConfig) -> RunConfig:
         if path_setting is not None:
             config = dataclasses.replace(config, **{name: expand_home(path_setting)})
 
-    # Settings that follow from the method and the decision.
+    # Settings that follow from the world, the method and the decision.
+    worlds = dataclasses.replace(config.worlds, front_cell=config.task.rules.front_cell)
+    config = dataclasses.replace(config, worlds=worlds)
     method = config.policy_method
     if not method.hosts_layout and config.arms == ARMS:
         config = dataclasses.replace(config, arms=("baseline",))

@@ -121,7 +121,6 @@ def comparable_settings(config: RunConfig) -> dict[str, Any]:
     Results of earlier versions are recognized by these settings.
     """
     settings = run_settings(config)
-    settings["worlds"]["front_cell"] = config.task.rules.front_cell  # None in an unchecked configuration
     for group_name, earlier_values in _EARLIER_SETTINGS.items():
         for name, earlier_value in earlier_values.items():
             if settings[group_name][name] == earlier_value:

@@ -27,7 +27,6 @@ MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT, LOOK_UP, LOOK_DOWN, DONE = range(NUM_ACTI
 #: (dz, dx) of the eight neighbouring cells, clockwise from +z.
 NEIGHBOURS = np.array([(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)])
 
-
 #: Cell in front of the agent that a view shows, see `Rules.front_cell`.
 FrontCell = Literal["move", "nearest"]
 
@@ -53,7 +52,8 @@ class Rules:
     horizons: tuple[float, ...] = (0.0, 30.0)
     field_of_view: tuple[float, float] = (100.0, 100.0)
     camera: float = 1.5
-    front_cell: FrontCell = "nearest"
+    # Not a part of the text, which the checksums of banks and benchmarks from before this setting contain.
+    front_cell: FrontCell = dataclasses.field(default="nearest", repr=False)
     success: Literal["seen", "near"] = "seen"
     success_distance: float = 1.5
 

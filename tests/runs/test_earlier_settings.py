@@ -65,11 +65,27 @@ def test_homes_of_an_earlier_version_have_the_earlier_views(tmp_path):
     (tmp_path / "run").mkdir()
     write_json_with_digest(tmp_path / "run" / "config.json", settings)
     assert load_run_config(tmp_path / "run").task.rules.front_cell == "nearest"
+
+    # The run resumes under its own settings; today's views would make it another run.
+    claim_run_dir(earlier_config)
     assert manifest_settings(earlier_config) == settings
+    with pytest.raises(InputError, match=r"worlds.front_cell: 'nearest' != 'move'"):
+        claim_run_dir(make_config(world="houses", run_dir=tmp_path / "run"))
 
     assert "front_cell" not in comparable_settings(earlier_config)["worlds"]
-    assert comparable_settings(RunConfig(world="houses"))["worlds"]["front_cell"] == "move"
-    assert "front_cell" not in comparable_settings(RunConfig(world="rooms"))["worlds"]
+    assert comparable_settings(make_config(world="houses"))["worlds"]["front_cell"] == "move"
+    assert "front_cell" not in comparable_settings(make_config(world="rooms"))["worlds"]
+
+
+def test_rooms_of_an_earlier_version_resume_with_the_same_command(tmp_path):
+    """In rooms both kinds of views are the same, so the defaults of today are those of the earlier run."""
+    config = make_config(world="rooms", run_dir=tmp_path / "run")
+    settings = run_settings(config)
+    del settings["worlds"]["front_cell"]
+    (tmp_path / "run").mkdir()
+    write_json_with_digest(tmp_path / "run" / "config.json", settings)
+    claim_run_dir(config)
+    assert manifest_settings(config) == settings
 
 
 def test_a_missing_setting_is_refused(tmp_path):

@@ -295,7 +295,8 @@ def _open_shards(folder: Path, job: ShardJob) -> Shards:
 def _cache_key(scenes: "Scenes", task: Task, shard_scenes: int) -> str:
     """Return a hash of the scenes, the task and the code that determine the shards."""
     # Scenes and settings first, then the path and content of each file of the code.
-    code_digest = hashlib.sha256(repr((scenes.identity, task, shard_scenes, np.__version__)).encode())
+    identity = scenes.identity, dataclasses.asdict(task), shard_scenes, np.__version__
+    code_digest = hashlib.sha256(repr(identity).encode())
     code_files = set()
     for code_pattern in _CODE:
         code_files.update(_SOURCE.glob(code_pattern))
