@@ -24,7 +24,7 @@ from jaxnav.scenes.tables.observation_row import (
     RowFormat,
     relative_position,
 )
-from jaxnav.scenes.task import MOVE_AHEAD, Rules
+from jaxnav.scenes.task import MOVE_AHEAD, FrontCell, Rules
 
 #: Number of categories that a cell can hold, one in each of its lowest bits.
 MAX_CATEGORIES = 27
@@ -68,13 +68,13 @@ class ViewTable(NamedTuple):
 
     Attributes:
       offsets: int32 [H, V V, 2], (dz, dx) from the agent, by heading.
-      distances: float32 [H, V V], metres from the agent.
+      distances: float64 [H, V V], metres from the agent.
       twins: int32 [H, V V], for each cell of the view its twin in the same map cell; the cell itself if it has none.
     """
 
-    offsets: Any
-    distances: Any
-    twins: Any
+    offsets: np.ndarray
+    distances: np.ndarray
+    twins: np.ndarray
 
 
 def draw_view(
@@ -102,7 +102,7 @@ def draw_view(
     size = len(cells)
     offsets = jnp.asarray(view_table.offsets)[heading]
     twins = jnp.asarray(view_table.twins)[heading]
-    is_near = jnp.asarray(view_table.distances)[heading] <= MIN_RANGE
+    is_near = jnp.asarray(view_table.distances <= MIN_RANGE)[heading]
     rows, columns = ((position[None] + offsets) % size).T
     view = row_format.view_cells(row)
     view = jnp.maximum(view, view[twins])
@@ -164,12 +164,11 @@ def nearest_looks(
     """
     # Squares and distance bins of the cells of the view, [V V].
     offsets = jnp.asarray(view_table.offsets)[heading]
-    distances = jnp.asarray(view_table.distances)[heading]
-    seen_bins = jnp.minimum(distances / LOOK_SPACING, NUM_LOOK_DISTANCES - 1).astype(jnp.int32)
+    bin_table = np.minimum(view_table.distances / LOOK_SPACING, NUM_LOOK_DISTANCES - 1).astype(np.int32)
     rows, columns = ((position[None] + offsets) % size // SQUARE_CELLS).T
     view = row_format.view_cells(row)
     is_seen = (view == VIEW_FREE) | (view == VIEW_BLOCKED)
-    distance_bins = jnp.where(is_seen, seen_bins, NUM_LOOK_DISTANCES)
+    distance_bins = jnp.where(is_seen, jnp.asarray(bin_table)[heading], NUM_LOOK_DISTANCES)
 
     num_squares = size // SQUARE_CELLS
     unseen = jnp.full((num_squares, num_squares), NUM_LOOK_DISTANCES, jnp.int32)
@@ -211,9 +210,9 @@ def category_bit(category: jax.Array) -> jax.Array:
 
 @functools.lru_cache
 def make_view_table(rules: Rules, view: int) -> ViewTable:
-    """Return the cells of a view of V x V cells, by heading, as NumPy arrays."""
+    """Return the cells of a view of V x V cells, by heading."""
     offsets = rules.view_offsets(view).reshape(rules.headings, -1, 2).astype(np.int32)
-    distances = (CELL_SIZE * np.hypot(offsets[..., 0], offsets[..., 1])).astype(np.float32)
+    distances = CELL_SIZE * np.hypot(*np.moveaxis(offsets, -1, 0))
     is_same_cell = (offsets[:, :, None] == offsets[:, None]).all(axis=-1)
     num_cells = is_same_cell.shape[-1]
 
@@ -228,15 +227,12 @@ def learned_view_table(setup: Mapping[str, Any], view: int) -> ViewTable:
     """Return the cells of a view under the rules of the training homes.
 
     Args:
-      setup: what SemExp learned before training; `front_cell_is_move` is missing in earlier exports.
+      setup: what SemExp learned before training; only tasks with `front_cell="move"` have `front_cell_is_move`.
       view: V, cells along each side of a view.
     """
-    headings = len(setup["steps"])
-    earlier_table = make_view_table(Rules(headings=headings, front_cell="nearest"), view)
-    if "front_cell_is_move" not in setup:
-        return earlier_table
-    table = make_view_table(Rules(headings=headings, front_cell="move"), view)
-    return jax.tree.map(functools.partial(jnp.where, setup["front_cell_is_move"]), table, earlier_table)
+    # Which entries there are is known when a program is traced, so the table is a constant of the program.
+    front_cell: FrontCell = "move" if "front_cell_is_move" in setup else "nearest"
+    return make_view_table(Rules(headings=len(setup["steps"]), front_cell=front_cell), view)
 
 
 # The tracker

@@ -119,8 +119,7 @@ def learn_search_setup(banks: Iterable[Bank], counts: np.ndarray) -> dict[str, n
     Returns:
       The values of `learn_motion`, and by name `enough`, float32 [], metres within which Done succeeds; `edge`, float32
       [], the share of a goal's apparent size that is added to these metres; `lines`, int32 [N], the row indices of a
-      map that holds the largest home; `front_cell_is_move`, bool [], True where the
-      front cell of a view is the cell that MoveAhead leads to.
+      map that holds the largest home; `front_cell_is_move`, bool [], True, only if `Rules.front_cell` is `move`.
 
     Raises:
       InputError: the map has no bit for a category, or the agent cannot walk to all eight neighbours.
@@ -147,8 +146,9 @@ def learn_search_setup(banks: Iterable[Bank], counts: np.ndarray) -> dict[str, n
         "enough": np.array(rules.success_distance - DISTANCE_SLACK, np.float32),
         "edge": np.array(0.25 if rules.success == "near" else 0.0, np.float32),
         "lines": np.arange(map_size, dtype=np.int32),
-        "front_cell_is_move": np.array(rules.front_cell == "move"),
     }
+    if rules.front_cell == "move":
+        setup["front_cell_is_move"] = np.array(True)
     return learn_motion(banks, counts) | setup
 
 
