@@ -244,7 +244,7 @@ def test_smaller_configurations_keep_the_letter(name):
     config = load_config(name)
     ppo = dataclasses.replace(config.ppo, learning_rate=rate_of_paper)
     assert dataclasses.replace(config, ppo=ppo, **sizes_of_paper) == load_config("paper")
-    assert config.worlds == WorldConfig(shaping=0, near_starts=0)
+    assert config.worlds == WorldConfig(shaping=0, near_starts=0, front_cell="nearest")
 
 
 # Policies that count instances
