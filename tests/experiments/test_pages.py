@@ -434,6 +434,13 @@ def test_a_world_may_be_measured_on_one_split_alone(tmp_path):
     assert [title.split(":")[0] for title in titles] == ["## rooms, val", "## apartments, val", "## rooms, test"]
 
 
+def test_methods_page_of_agents_that_choose_goals_only_has_no_row_of_random_actions(tmp_path):
+    config = ExperimentConfig(worlds={"houses": {"world": "houses"}}, agents={"semexp": {"method": "semexp"}})
+    text = render(tmp_path, "methods", *make_agent_rows("houses", "semexp", baseline=60.0), config=config)
+    assert read_lines(text)["`semexp`"]
+    assert "Random" not in read_lines(text)
+
+
 # The paper's tables
 
 
