@@ -62,8 +62,8 @@ def test_a_smaller_version_is_an_experiment_of_its_own(capsys):
     )
     assert study("study", "--config", "quik") == 2
     assert "--config quik: is unknown; choose from ithor, quick" in refusal(capsys)
-    assert study("table2", "--config", "quick") == 2
-    assert "table2 has no other version; omit --config" in refusal(capsys)
+    assert study("table3", "--config", "quick") == 2
+    assert "table3 has no other version; omit --config" in refusal(capsys)
 
 
 def test_study_lists_the_experiments_for_an_unknown_one(capsys):
