@@ -318,7 +318,21 @@ def export_policy(
     arrays = knowledge_to_arrays(knowledge) | {"policy": jax.device_get(params)}
     arrays["layout"]["counts"] = np.asarray(explored.prior_counts)
 
-    export_params(folder, arrays, fields)
+    export_params(folder, arrays, fields, _complete_fields)
+
+
+def _complete_fields(fields: dict[str, Any]) -> dict[str, Any]:
+    """Add the fields that an export of an earlier version lacks, with the values that its loader gives them."""
+    try:
+        policy_spec = PolicySpec.from_json(fields, find_method(fields["method"]), len(fields["categories"]))
+        estimator_fields = fields["layout"]
+        completed = policy_spec.to_json() | {
+            "task": dataclasses.asdict(Task.from_json(fields["task"])),
+            "layout": None if estimator_fields is None else dataclasses.asdict(EstimatorConfig(**estimator_fields)),
+        }
+    except (InputError, KeyError, TypeError, ValueError, AttributeError):
+        return fields  # this version cannot load it, so it is another policy
+    return fields | json.loads(json.dumps(completed))
 
 
 def knowledge_to_arrays(knowledge: Knowledge) -> dict[str, Any]:

@@ -5,7 +5,7 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,19 +33,25 @@ class _OtherVersionError(InputError):
     """Error about an export of another format version."""
 
 
-def export_params(folder: Path, arrays: Mapping[str, Any], fields: Mapping[str, Any]) -> None:
+def export_params(
+    folder: Path,
+    arrays: Mapping[str, Any],
+    fields: Mapping[str, Any],
+    complete_fields: Callable[[dict[str, Any]], dict[str, Any]] = dict,
+) -> None:
     """Write the arrays of a policy and the fields that describe it.
 
     `params.safetensors` has flat names, `a/b/kernel`. `policy.json` has `format_version`, the fields as `spec`, the
     SHA-256 of the arrays and a digest of its own. Because `policy.json` is written last, `load_params` refuses an
     export that was cut short. An equal export stays, a damaged one is replaced, and a different one is refused.
-    Exports are equal if all fields, names, shapes and dtypes are, and if all numbers differ by at most `TOLERANCE`. An
-    export of an earlier version may lack fields that were added since.
+    Exports are equal if all fields, names, shapes and dtypes are, and if all numbers differ by at most `TOLERANCE`.
 
     Args:
       folder: created if missing.
       arrays: nested dict of arrays; names are strings without `/`.
       fields: JSON values by name, such as the specification of the network.
+      complete_fields: adds to the fields of an export those that an earlier version did not write, before exports are
+        compared.
 
     Raises:
       InputError: the folder holds another export, or one of another format version.
@@ -71,17 +77,11 @@ def export_params(folder: Path, arrays: Mapping[str, Any], fields: Mapping[str, 
         return
 
     # Compare fields as JSON, in which tuples are lists.
-    has_equal_fields = _has_fields_of(json.loads(json.dumps(fields)), existing_policy["spec"])
+    new_fields = json.loads(json.dumps(fields))
+    has_equal_fields = complete_fields(existing_policy["spec"]) == complete_fields(new_fields)
     existing_arrays = safetensors.numpy.load_file(folder / PARAMS_FILE)
     if not (has_equal_fields and _are_close(existing_arrays, flat_arrays)):
         raise InputError(f"{folder}: holds another policy, which is not overwritten; move or remove the folder")
-
-
-def _has_fields_of(value: Any, earlier_value: Any) -> bool:
-    """True if two JSON values are equal, but for fields of objects that only the first has."""
-    if not (isinstance(value, dict) and isinstance(earlier_value, dict)):
-        return value == earlier_value
-    return all(name in value and _has_fields_of(value[name], field) for name, field in earlier_value.items())
 
 
 def _are_close(first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray]) -> bool:

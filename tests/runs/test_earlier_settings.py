@@ -3,15 +3,19 @@
 import dataclasses
 import shutil
 
+import jax.numpy as jnp
 import pytest
+from support.commands import contents
 from support.mutations import resigned
 
 import jaxnav
 from jaxnav.errors import InputError
 from jaxnav.runs.config import RunConfig, WorldConfig, check_config
-from jaxnav.runs.policies import POLICIES_DIR
+from jaxnav.runs.policies import POLICIES_DIR, export_policy, knowledge_from_arrays
 from jaxnav.runs.run import claim_run_dir, comparable_settings, load_run_config, manifest_settings, run_settings
+from jaxnav.store.export import load_params
 from jaxnav.store.files import write_json_with_digest
+from jaxnav.training.calibration import Exploration
 from jaxnav.training.config import PPOConfig
 
 
@@ -95,6 +99,31 @@ def test_a_missing_setting_is_refused(tmp_path):
     write_json_with_digest(tmp_path / "run" / "config.json", settings)
     with pytest.raises(InputError, match=r"lacks settings \(ppo.gamma: \(absent\) != 0.99\)"):
         load_run_config(tmp_path / "run")
+
+
+@pytest.mark.parametrize("front_cell", ["nearest", "move"])
+def test_an_export_of_an_earlier_version_stays_where_its_policy_is_exported_again(drawn_run, tmp_path, front_cell):
+    """An export without the field has the earlier views, so it is another policy than one with today's."""
+    config = make_config(world="houses", worlds=WorldConfig(front_cell=front_cell), sizes=drawn_run.config.sizes)
+    arrays, _ = load_params(drawn_run.config.run_dir / POLICIES_DIR / "baseline-0")
+    counts = jnp.asarray(arrays["layout"]["counts"])
+    exploration = Exploration(counts, prior_counts=counts, steps=jnp.int32(10), poses=jnp.int32(4))
+    knowledge = knowledge_from_arrays(arrays)
+
+    def export_again():
+        export_policy(tmp_path, config, arrays["policy"], knowledge, None, exploration)
+
+    export_again()
+    with resigned(tmp_path / "policy.json") as exported:
+        del exported["spec"]["task"]["rules"]["front_cell"], exported["spec"]["spatial_memory"]["front_cell"]
+    earlier_files = contents(tmp_path)
+
+    if front_cell == "nearest":
+        export_again()
+    else:
+        with pytest.raises(InputError, match="another policy"):
+            export_again()
+    assert contents(tmp_path) == earlier_files
 
 
 def test_a_policy_of_an_earlier_version_is_loaded(drawn_run, tmp_path):

@@ -74,22 +74,6 @@ def test_exports_are_compared_by_numbers(tmp_path, other_kernel, is_equal):
     assert contents(tmp_path) == exported_files
 
 
-def test_an_export_of_an_earlier_version_may_lack_fields(tmp_path):
-    earlier_fields = {"method": "org", "task": {"headings": 8}}
-    export_params(tmp_path, PARAMS, earlier_fields)
-    exported_files = contents(tmp_path)
-
-    # Fields that were added since change nothing; other values, fields that are gone, and other numbers are refused.
-    fields = {"method": "org", "task": {"headings": 8, "front_cell": "nearest"}, "goal_row": True}
-    export_params(tmp_path, PARAMS, fields)
-    for other_fields in (fields | {"task": {"headings": 12}}, fields | {"task": {}}, {"method": "org"}):
-        with pytest.raises(InputError, match="another policy"):
-            export_params(tmp_path, PARAMS, other_fields)
-    with pytest.raises(InputError, match="another policy"):
-        export_params(tmp_path, {"scale": np.float32(3)}, fields)
-    assert contents(tmp_path) == exported_files
-
-
 def test_whole_numbers_of_equal_exports_are_exact(tmp_path):
     steps = np.array([10**6, 0], np.int32)
     export_params(tmp_path, {"steps": steps}, SPEC)
