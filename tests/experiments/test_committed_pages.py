@@ -95,8 +95,11 @@ def test_pages_can_be_written_from_the_first_result_on(name, tmp_path):
     (config.results / "val").mkdir(parents=True)
 
     # Parts arrive one after the other; a few of them, with the first and the last, stand for all.
+    # Results of an unfinished experiment are still missing, which its page tells.
     for index, part in enumerate(parts):
-        shutil.copy(COMMITTED[name].results / "val" / f"{part.name}.jsonl", config.results / "val")
+        path = COMMITTED[name].results / "val" / f"{part.name}.jsonl"
+        if path.exists():
+            shutil.copy(path, config.results / "val")
         if index in (0, len(parts) // 3, 2 * len(parts) // 3, len(parts) - 1):
             for text in write_pages(config, parts):
                 assert text.count(READING_MARK) == 2
@@ -106,7 +109,7 @@ def test_pages_can_be_written_from_the_first_result_on(name, tmp_path):
 # Agents of the tables
 
 
-@pytest.mark.parametrize("name", ["table2", "table2_rooms"])
+@pytest.mark.parametrize("name", ["table2", "table2_earlier"])
 def test_table_2_has_the_methods_of_the_paper(name):
     # Beside them are layout-blind agents, EOTP adapted to ever changing scenes, and further seeds of ORG.
     methods = set(COMMITTED[name].agents) - {"anonymous", "eotp:ADAPTED", "org-again"}
@@ -124,7 +127,7 @@ def test_table_2_has_the_methods_of_the_paper(name):
             assert f"{run.agent}-streams" in methods
 
 
-@pytest.mark.parametrize("name", ["table2", "table2_rooms", "table3", "ablations", "real", "real_homes"])
+@pytest.mark.parametrize("name", ["table2", "table2_earlier", "table3", "ablations", "real", "real_homes"])
 def test_all_methods_of_a_world_learn_from_as_many_steps(name):
     runs_by_world: dict[str, list] = {}
     for run in agent_runs(COMMITTED[name]):
