@@ -535,6 +535,32 @@ def test_methods_with_idle_experience_have_no_verdict(tmp_path):
     assert effect_of_weights == '<span class="idle">+5.0 [+4.0, +6.0]</span>'
 
 
+def test_claims_of_the_study_on_idle_experience_have_no_verdict(tmp_path):
+    # The share of the arm with w counts: 4 %. The loss of the baseline is a claim on neither w nor sTDE.
+    shares = [make_share("main", "baseline", 20.0), make_share("main", "layout", 4.0)]
+    text = render(tmp_path, "study", *study_rows(), *shares)
+    assert find_claim(text, "w improves the baseline at shift 1")[-1] == "experience is idle"
+    assert find_claim(text, "sTDE (epsilon 0.5) improves w at shift 1")[-1] == "experience is idle"
+    assert find_claim(text, "The baseline loses success")[-1] != "experience is idle"
+    assert "decide 20.0 [19.0, 21.0] % of the decisions of the baseline and 4.0 [3.0, 5.0] %" in text
+
+    # With 12 % all claims are judged.
+    text = render(tmp_path, "study", *study_rows(), shares[0], make_share("main", "layout", 12.0))
+    assert "experience is idle" not in text
+
+
+def test_agents_of_factors_have_their_decision_share(tmp_path):
+    agents = {"base": {"arms": ["baseline"]}, "w": {"arms": ["layout"], "against": ["base/baseline"]}}
+    config = ExperimentConfig(agents=agents, shifts=(0.0,))
+    rows = [*make_agent_rows("rooms", "base", baseline=50.0), *make_agent_rows("rooms", "w", layout=60.0)]
+    shares = [make_share("base", "baseline", 3.0), make_share("w", "layout", 8.0)]
+    cells = read_lines(render(tmp_path, "factors", *rows, *shares, config=config))
+    assert cells["`base`"][-1] == "3.0 [2.0, 4.0]"
+    assert cells["`w`"][-1] == "8.0 [7.0, 9.0]"
+    # Earlier results have no shares, and the table no column.
+    assert len(read_lines(render(tmp_path, "factors", *rows, config=config))["`w`"]) == len(cells["`w`"]) - 1
+
+
 def test_gains_of_worlds_are_compared_by_both_intervals(tmp_path):
     rows = [
         make_effect("apartments", "hosts", "stde", "baseline", make_interval(10.0)),
