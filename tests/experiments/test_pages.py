@@ -575,6 +575,19 @@ def test_gains_of_worlds_are_compared_by_both_intervals(tmp_path):
     assert cells["gains: hosts in rooms over `semexp` in houses"] == ["+3.9", "+5.0 [+3.0, +7.0]", "holds"]
 
 
+def test_scenes_of_a_dataset_have_columns_beside_those_of_the_paper(tmp_path):
+    rows = [*make_agent_rows("rooms", "org", baseline=90.0), *make_agent_rows("ithor", "org", baseline=88.0)]
+    effect = make_effect("ithor", "org", "layout", "baseline", make_interval(1.0, 3.0))
+    text = render_paper(tmp_path, *rows, effect)
+    cells = read_lines(text.split("### Table 2: AI2-THOR")[1].split("###")[0])
+    assert cells["`org`"] == ["66.53", "39.00", "0.54", "90.0 [-]", "-", "-", "88.0 [-]", "-", "-"]
+    # The ordering is judged in these scenes, too, next to the gain of the paper's Table 1: 71.40 - 66.48.
+    assert read_lines(text)["ithor: `org` + w over `org`"] == ["+4.9", "+1.0 [-2.0, +4.0]", "inconclusive"]
+    # Datasets that were not run have neither columns nor lines.
+    assert len(read_lines(text.split("### Table 2: RoboTHOR")[1].split("###")[0])["`org`"]) == 6
+    assert not any(name.startswith("robothor") for name in read_lines(text))
+
+
 @pytest.mark.parametrize(
     ("title", "num_lines", "gains"),
     [
