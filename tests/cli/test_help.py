@@ -131,7 +131,7 @@ def test_help_leaves_the_settings_of_a_run_as_they_are(tmp_path):
 
 def test_study_help_shows_the_settings_of_the_experiment(capsys):
     text = read_help(capsys, "study", "table2")
-    assert "(default: results/tables)" in text
+    assert "(default: results/paper)" in text
     assert "(default: results/experiment)" in read_help(capsys, "study")
 
 
