@@ -4,6 +4,7 @@
 decoding rule) has a file of results, so that an interrupted experiment goes on with the first part that is missing.
 """
 
+import dataclasses
 import glob
 import shutil
 from collections.abc import Callable, Collection, Iterator
@@ -161,6 +162,8 @@ def run_experiment(config: ExperimentConfig, console: Console) -> list[str]:
     bench = Bench(config, console)
     parts = list_parts(config, bench)
     missing_parts = [part for part in parts if not _is_finished(folder, part)]
+    # Pages show all agents, and tell what is missing of those that `only` leaves out, too.
+    all_parts = list_parts(dataclasses.replace(config, only=("*",)), bench)
 
     # Pages are written again after every part. Only the last ones must be without faults.
     for part in missing_parts:
@@ -173,14 +176,14 @@ def run_experiment(config: ExperimentConfig, console: Console) -> list[str]:
         for unfinished_folder in folder.glob(f"{glob.escape(part.name)}-*.unfinished"):
             shutil.rmtree(unfinished_folder, ignore_errors=True)
         try:
-            write_pages(config, parts)
+            write_pages(config, all_parts)
         except InputError as error:
             console.print(f"warning: {error}", style="yellow")
 
     num_reused = len(parts) - len(missing_parts)
     if num_reused:
         console.print(f"{num_reused} results in {folder} were there already; give another --results to measure again")
-    texts = write_pages(config, parts)
+    texts = write_pages(config, all_parts)
     for document in config.pages:
         console.print(f"written to {document}")
     return texts
