@@ -99,6 +99,12 @@ def test_driver_measures_every_part_and_writes_the_page(measured, tmp_path):
     assert "| b | 0.5 |  | 50.5 |" in page
 
 
+def test_page_tells_what_is_missing_of_agents_that_were_not_selected(measured, tmp_path):
+    (text,) = run_experiment(make_config(tmp_path, only=("near-a",)), QUIET)
+    assert measured == ALL_CALLS[:2]
+    assert "Missing: 3." in text  # both shifts of b, and its whole
+
+
 def test_driver_reuses_everything_the_second_time(measured, tmp_path):
     config = make_config(tmp_path)
     run_experiment(config, QUIET)
