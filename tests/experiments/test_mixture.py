@@ -240,7 +240,7 @@ def test_handover_leaves_the_layout_blind_agents(bench):
             assert agent.mean + change.mean == pytest.approx(layout_blind.mean)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_folds_of_a_dataset_count_as_one_world(make_bench, drawn_run):
     # Two folds share 16 episodes, so every mean over the dataset is that of the folds with eight episodes each.
     run = {"run": str(drawn_run.config.run_dir)}

@@ -9,7 +9,10 @@ import shutil
 
 import pytest
 from support.disks import FILE_LIMITS, SIZE_LIMITS, can_mount, foreign_lines, train_on_small_disk
+from support.tiers import params_by_tier
 from support.tiny_run import POLICY_NAMES, finished_run
+
+LIMITS = [SIZE_LIMITS[0], SIZE_LIMITS[2], SIZE_LIMITS[7], FILE_LIMITS[1], FILE_LIMITS[6]]
 
 
 @pytest.fixture(scope="module")
@@ -17,9 +20,8 @@ def whole_run(tmp_path_factory):
     return finished_run(tmp_path_factory)
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(os.geteuid() != 0 or shutil.which("mount") is None, reason="only root mounts a file system")
-@pytest.mark.parametrize("limit", [SIZE_LIMITS[0], SIZE_LIMITS[2], SIZE_LIMITS[7], FILE_LIMITS[1], FILE_LIMITS[6]])
+@pytest.mark.parametrize("limit", params_by_tier(LIMITS, slow=LIMITS[1::2]))
 def test_training_on_a_full_disk_is_one_line_and_loses_nothing(whole_run, tmp_path, limit):
     if not can_mount(tmp_path / "probe"):
         pytest.skip("no file system can be mounted here")

@@ -63,7 +63,7 @@ wait "${{tasks[0]}}" && wait "${{tasks[1]}}"
 """
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_slurm_script_trains_one_run_on_two_hosts(tmp_path):
     """Only `srun` is replaced: the script, and how JAX finds the processes of a job, are those of a cluster."""
     srun = tmp_path / "srun"
