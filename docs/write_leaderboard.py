@@ -58,9 +58,9 @@ def write_table(track: str, lines: list[tuple[str, dict[str, Any]]]) -> str:
 def write_page() -> str:
     """Text of the page."""
     text, _, _ = (ROOT / "docs" / "leaderboard.md").read_text(encoding="utf-8").partition(MARK)
-    lines = read_lines("v1")
+    lines = read_lines("v2")
     sections = [text + MARK + "\n"]
-    for track in load_benchmark("v1").tracks:
+    for track in load_benchmark("v2").tracks:
         sections.append(f"\n## {track.name.capitalize()}\n\n{write_table(track.name, lines)}")
     return "".join(sections)
 

@@ -2,7 +2,7 @@
 
 python examples/ppo_loop.py                     # two million steps, a minute or two on two cores
 python examples/ppo_loop.py --steps 100000      # a first try
-python examples/ppo_loop.py --benchmark         # also the rooms of the benchmark v1
+python examples/ppo_loop.py --benchmark         # also the rooms of the benchmark v2
 """
 
 import argparse

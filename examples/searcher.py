@@ -1,7 +1,7 @@
 """An agent without training: walk ahead, turn at obstacles and towards the goal, and say Done within 1.4 m of it.
 
 jaxnav eval examples.searcher:searcher                     # from the root of the repository
-jaxnav eval examples.searcher:searcher --benchmark v1
+jaxnav eval examples.searcher:searcher --benchmark v2
 """
 
 import numpy as np

@@ -73,8 +73,8 @@ class EvalConfig:
         `categories`: the categories other than the goal within experience, on a quarter of the episodes. `all`: every
         part, on all episodes. The shares of decisions that change are always measured.
       seed: random seed of the episode list and of sampled actions, from 0 to 4,294,967,295.
-      benchmark: name of a frozen benchmark (`v1`), which fixes homes, shifts, episodes and seeds; scores the subject on
-        its tracks (docs/leaderboard.md).
+      benchmark: name of a frozen benchmark (`v2`, or `v1` with earlier views), which fixes homes, shifts, episodes and
+        seeds; scores the subject on its tracks (docs/leaderboard.md).
       tracks: tracks of the benchmark, such as `rooms`. The default is all tracks with the categories of a policy, and
         all tracks for an agent.
       json: JSON file to write. The default is a name after the options, such as `eval-val-shift1-seed3.json`, in the

@@ -167,7 +167,7 @@ class BenchmarkScores(NamedTuple):
 
 def run_benchmark(
     subject: Any,
-    name: str = "v1",
+    name: str = "v2",
     tracks: Sequence[str] | None = None,
     console: Console | None = None,
     **policy_options: Any,

@@ -232,7 +232,7 @@ def load_policy(
 
     Args:
       path: folder of one policy, such as `runs/rooms/policies/layout-0`; or the name of one that comes with the
-        package: `rooms-org`, `houses-org`, `houses-belief` or `apartments-belief`.
+        package: `rooms-org`, `apartments-org`, `houses-org`, `apartments-belief` or `houses-belief`.
       setting, hold: layout estimator to use in place of the policy's; see `Policies.with_estimator`.
       form: form in which sTDE combines the logits; None for the form of the estimator.
       env: environment in which the policy will act, to check that they fit; None skips the check.

@@ -154,13 +154,13 @@ def test_eval_report_names_differ_for_a_world_and_a_file():
 
 
 def test_scores_of_other_settings_have_other_files():
-    config = EvalConfig("rooms-org", benchmark="v1")
+    config = EvalConfig("rooms-org", benchmark="v2")
     configs = [config, dataclasses.replace(config, subject="runs/rooms")]
     configs += [dataclasses.replace(config, tracks=tracks) for tracks in (("rooms",), ("rooms", "houses"))]
     for name in ("epsilon", "form", "setting", "hold", "inner_steps", "removal", "counterfactual_memory", "costs"):
         configs += [dataclasses.replace(config, **{name: value}) for value in OTHER_OPTIONS[name]]
     targets = [str(_find_target(config)) for config in configs]
-    assert targets[0] == "benchmark-v1-rooms-org-all.json"
+    assert targets[0] == "benchmark-v2-rooms-org-all.json"
     assert len(set(targets)) == len(configs)
 
 

@@ -1,6 +1,7 @@
 """A game by scripted keys is the environment's episode, and shows what an agent perceives."""
 
 import itertools
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,8 @@ from jaxnav.runs.policy import LoadedPolicy
 from jaxnav.scenes.files.scene_file import write_scenes
 from jaxnav.scenes.task import NUM_ACTIONS
 from jaxnav.scenes.worlds import make_generated_scenes
+
+EARLIER_POLICY = Path(__file__).parents[2] / "results" / "claims" / "runs" / "houses-org" / "policies" / "layout-0"
 
 EPSILON = 0.1
 WORLD = tiny.compiled_world()
@@ -183,10 +186,10 @@ def test_prepare_game_refuses_a_policy_of_another_world():
 
 
 def test_a_game_has_the_views_that_its_policy_was_trained_with(tmp_path):
-    """`houses-org` is of an earlier version, and houses of today have other views."""
+    """The claims' policies are of an earlier version, and houses of today have other views."""
     scenes = tmp_path / "scenes.jsonl.gz"
     write_scenes(scenes, [make_generated_scenes("houses", "val", 1)[0]])
-    game = prepare_game(PlayConfig("houses", scenes=scenes, policy="houses-org"), Console(quiet=True))
+    game = prepare_game(PlayConfig("houses", scenes=scenes, policy=str(EARLIER_POLICY)), Console(quiet=True))
     assert game.policy is not None
     assert game.world.env.task.rules == game.policy.task.rules
     assert game.world.env.task.rules.front_cell == "nearest"

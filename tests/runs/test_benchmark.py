@@ -100,22 +100,34 @@ def test_checksum_covers_tables_and_episodes(tiny_benchmark):
     assert checksum_track(load_benchmark("tiny"), compiled) != track.checksums[0]
 
 
-def test_version_one_is_frozen():
-    benchmark = load_benchmark("v1")
-    assert [track.name for track in benchmark.tracks] == ["rooms", "apartments", "houses"]
+#: Checksums of the tracks of every benchmark, at shifts 0 and 1.
+CHECKSUMS = {
+    "v1": {
+        "rooms": ("5793264d4cc97200", "8914c5a76c4432c4"),
+        "apartments": ("a4cb85187202557e", "7f3b1100a2a6b9cb"),
+        "houses": ("06403312f8ffd70e", "3e5c52342847c96d"),
+    },
+    "v2": {
+        "rooms": ("5793264d4cc97200", "8914c5a76c4432c4"),
+        "apartments": ("53374ad45ef53bba", "3441466bbf1dda3e"),
+        "houses": ("43c915505d2a1542", "63aef00b07f80e3a"),
+    },
+}
+
+
+@pytest.mark.parametrize("version", CHECKSUMS)
+def test_benchmarks_are_frozen(version):
+    benchmark = load_benchmark(version)
     settings = (benchmark.split, benchmark.scene_seed, benchmark.num_episodes, benchmark.episode_seed)
     assert settings == ("test", 4101, 1000, 0)
-    assert [track.checksums for track in benchmark.tracks] == [
-        ("5793264d4cc97200", "8914c5a76c4432c4"),
-        ("a4cb85187202557e", "7f3b1100a2a6b9cb"),
-        ("06403312f8ffd70e", "3e5c52342847c96d"),
-    ]
+    assert {track.name: track.checksums for track in benchmark.tracks} == CHECKSUMS[version]
 
 
 @pytest.mark.exhaustive
+@pytest.mark.parametrize("version", CHECKSUMS)
 @pytest.mark.parametrize("name", ["rooms", "apartments", "houses"])
-def test_homes_of_version_one_are_those_of_its_manifest(name):
-    benchmark = load_benchmark("v1")
+def test_homes_of_benchmarks_are_those_of_their_manifests(name, version):
+    benchmark = load_benchmark(version)
     (track,) = [track for track in benchmark.tracks if track.name == name]
     for shift, checksum in zip(benchmark.shifts, track.checksums, strict=True):
         compiled = compile_track(benchmark, track, shift, Console(quiet=True))
@@ -124,15 +136,15 @@ def test_homes_of_version_one_are_those_of_its_manifest(name):
 
 def test_policies_act_only_with_their_categories():
     with pytest.raises(jaxnav.InputError, match=r"rooms-org.*other categories.*houses"):
-        run_benchmark("rooms-org", "v1", tracks=["houses"])
+        run_benchmark("rooms-org", tracks=["houses"])
 
 
 @pytest.mark.parametrize(
     ("options", "named"),
     [
-        (["--benchmark", "v2"], "benchmark 'v2'.*v1"),
-        (["--benchmark", "v1", "--tracks", "gardens"], "track 'gardens'.*rooms, apartments, houses"),
-        (["--benchmark", "v1", "--shift", "1"], "--shift.*fixed"),
+        (["--benchmark", "v3"], "benchmark 'v3'.*v1"),
+        (["--benchmark", "v2", "--tracks", "gardens"], "track 'gardens'.*rooms, apartments, houses"),
+        (["--benchmark", "v2", "--shift", "1"], "--shift.*fixed"),
         (["--tracks", "rooms"], "--tracks rooms.*--benchmark"),
     ],
 )

@@ -12,6 +12,7 @@ from support.mutations import resigned
 import jaxnav
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import draw_episodes
+from jaxnav.runs.config import WorldConfig
 from jaxnav.runs.policies import (
     PACKAGED_POLICIES,
     POLICIES_DIR,
@@ -121,6 +122,7 @@ def test_policies_refuse_scenes_of_other_rules(tmp_path):
     scenes = tmp_path / "scenes.jsonl.gz"
     write_scenes(scenes, [make_generated_scenes("houses", "val", 1)[0]])
     _, policies = load_policy_as_run("houses-org")
-    world = compile_evaluation_world(jaxnav.RunConfig(world="houses"), "val", scenes, 0.0, Console(quiet=True))
-    with pytest.raises(InputError, match=r"other rules .* front_cell: 'nearest' != 'move'; .* --worlds.front-cell"):
+    config = jaxnav.RunConfig(world="houses", worlds=WorldConfig(front_cell="nearest"))
+    world = compile_evaluation_world(config, "val", scenes, 0.0, Console(quiet=True))
+    with pytest.raises(InputError, match=r"other rules .* front_cell: 'move' != 'nearest'; .* --worlds.front-cell"):
         policies.make_agent_loop(world)
