@@ -1,15 +1,14 @@
 """Speed of the search by belief: evaluation beside ORG's, and the time of a belief and a plan.
 
-`python benchmarks/belief_speed.py RUN [--episodes 256]` times in turns
+`python benchmarks/belief_speed.py [--episodes 256]` times in turns
 
-* the first 50 steps of parallel episodes with best actions and sTDE, for a run of the method `belief` and for the
-  packaged policy `houses-org`, in equal homes: environment steps per second, and their ratio;
+* the first 50 steps of parallel episodes with best actions and sTDE, for the packaged policies `houses-belief` and
+  `houses-org`, in equal homes: environment steps per second, and their ratio;
 * one plan (both beliefs, the walking steps to all squares, the scores of all targets) on maps of 64 x 64 and 96 x 96
   random cells, one map at a time.
 """
 
 import argparse
-import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -18,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 from _common import print_report, ratio_by_turn, steps_per_second, summarize, time_in_turns
 
-from jaxnav.errors import InputError
 from jaxnav.evaluation.grid import DecisionContext, infer_and_act, start_states
 from jaxnav.evaluation.variants import inference_grid, table_row
 from jaxnav.plain_console import PlainConsole
@@ -32,9 +30,7 @@ from jaxnav.policies.methods.map_tracker import (
 )
 from jaxnav.policies.network import bind
 from jaxnav.runs.evaluate import draw_episode_lists
-from jaxnav.runs.policies import Policies
-from jaxnav.runs.policy import find_policy_folder, read_exported_policy
-from jaxnav.runs.run import Run
+from jaxnav.runs.policies import Policies, load_policy_as_run
 from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world
 
 NUM_STEPS = 50
@@ -44,13 +40,11 @@ MAP_SIZES = (64, 96)
 NUM_MAPS = 64
 
 
-def main(run_dir: str, num_episodes: int) -> None:
-    run = Run.open(run_dir)
-    world = compile_evaluation_world(run.config, "val", None, 0.0, PlainConsole(stderr=True))
-    belief_policies = run.policies(("layout",)).with_estimator("surprise")
-    org_policy = read_exported_policy(find_policy_folder("houses-org"))
-    org_params = jax.tree.map(lambda leaf: leaf[None], org_policy.params)
-    org_policies = org_policy._replace(params=org_params, arms=("layout",))
+def main(num_episodes: int) -> None:
+    config, belief_policies = load_policy_as_run("houses-belief")
+    belief_policies = belief_policies.with_estimator("surprise")
+    _, org_policies = load_policy_as_run("houses-org")
+    world = compile_evaluation_world(config, "val", None, 0.0, PlainConsole(stderr=True))
     calls = {
         "belief": make_steps_call(belief_policies, world, num_episodes),
         "org": make_steps_call(org_policies, world, num_episodes),
@@ -125,10 +119,6 @@ def make_plan_call(policies: Policies, size: int) -> Callable[[], Any]:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("run")
     parser.add_argument("--episodes", type=int, default=256)
     options = parser.parse_args()
-    try:
-        main(options.run, options.episodes)
-    except InputError as error:
-        sys.exit(f"error: {error}")
+    main(options.episodes)
