@@ -25,6 +25,9 @@ from jaxnav.scenes.scene import floor_plan_name
 #: Scenes give an interval from this many degrees of freedom on: three scenes, or more with several room types.
 MIN_SCENE_DEGREES = 2
 
+#: Correlations beyond this count as this, because Fisher's z of 1 is infinite.
+_MAX_CORRELATION = 1 - 1e-12
+
 
 @dataclasses.dataclass(frozen=True)
 class Interval:
@@ -320,6 +323,22 @@ def jackknife_interval(
     # Quantile of Student's t for a two-sided interval of 95 %.
     half_width = float(stdtrit(total_degrees, 0.975)) * math.sqrt(total_variance)
     return Interval(estimate, estimate - half_width, estimate + half_width, std=std, seeds=seeds)
+
+
+def correlation_interval(replicates: np.ndarray, scenes: Clusters, runs: Clusters | None = None) -> Interval:
+    """Compute the interval of a correlation from its leave-one-out replicates.
+
+    The jackknife is that of Fisher's z, the inverse hyperbolic tangent of the correlation, so the interval stays within
+    -1 and 1.
+
+    Args:
+      replicates, scenes, runs: as in `jackknife_interval`; replicates are in [-1, 1].
+    """
+    # A correlation of 1, as that of two points, has no finite z.
+    fisher_z = np.arctanh(np.clip(replicates, -_MAX_CORRELATION, _MAX_CORRELATION))
+    interval = jackknife_interval(fisher_z, scenes, runs)
+    estimate = float(np.atleast_2d(replicates)[0, 0])
+    return Interval(estimate, math.tanh(interval.low), math.tanh(interval.high))
 
 
 def scene_clusters(plans: np.ndarray, rooms: np.ndarray, counts: np.ndarray | None = None) -> Clusters:

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.similarity import expected_cooccurrence
-from jaxnav.evaluation.statistics import Interval, jackknife_interval, run_clusters, weight_below
+from jaxnav.evaluation.statistics import Interval, correlation_interval, jackknife_interval, run_clusters, weight_below
 from jaxnav.experiments.table import Curve, ResultRow, ResultTable
 
 
@@ -136,8 +136,8 @@ def relate_success_to_similarity(points: SimilarityPoints, success: np.ndarray) 
         episodes=points.num_episodes,
         similarity=points.similarity,
         success=success_rates[:, 0],
-        pearson=jackknife_interval(np.stack(pearson_replicates), scenes, runs),
-        spearman=jackknife_interval(np.stack(spearman_replicates), scenes, runs),
+        pearson=correlation_interval(np.stack(pearson_replicates), scenes, runs),
+        spearman=correlation_interval(np.stack(spearman_replicates), scenes, runs),
     )
 
 
@@ -187,7 +187,7 @@ def relate_gain_to_similarity(
         baseline=category_means(100.0 * points.means(baseline.mean(axis=0)))[:, 0],
         gain=category_means(gains[:, 0])[:, 0],
         slope=jackknife_interval(0.1 * np.stack(slope_replicates), scenes, runs),
-        pearson=jackknife_interval(np.stack(pearson_replicates), scenes, runs),
+        pearson=correlation_interval(np.stack(pearson_replicates), scenes, runs),
     )
 
 

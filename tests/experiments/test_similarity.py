@@ -124,11 +124,11 @@ def test_the_interval_of_success_is_that_of_a_plain_loop():
                 rate = success[remaining_runs][:, is_of_point(points, scene, category)].mean()
                 similarity += [points.similarity[index]] * points.num_episodes[index]
                 rates += [rate] * points.num_episodes[index]
-        return float(correlate(similarity, rates)[0])
+        return np.arctanh(correlate(similarity, rates)[0])  # Fisher's z
 
     for interval, correlate in ((relation.pearson, pearsonr), (relation.spearman, spearmanr)):
-        expected = left_out(functools.partial(correlation, correlate), num_scenes, num_runs)
-        assert bounds(interval) == pytest.approx(expected)
+        expected_z = left_out(functools.partial(correlation, correlate), num_scenes, num_runs)
+        assert bounds(interval) == pytest.approx(np.tanh(expected_z))
 
 
 def test_training_runs_that_disagree_widen_the_interval_of_success():
@@ -168,11 +168,12 @@ def test_room_types_keep_their_shares():
         covariance = np.cov(relation.similarity, relation.success, aweights=point_weights)
         return covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1])
 
-    # Jackknife variance within each of the two strata: 7 scenes - 2 degrees of freedom.
+    # Jackknife variance of Fisher's z within each of the two strata: 7 scenes - 2 degrees of freedom.
     room_sizes = np.bincount(room)[room]
-    squares = np.array([(pearson_without(scene) - relation.pearson.mean) ** 2 for scene in range(7)])
+    fisher_z = np.arctanh(relation.pearson.mean)
+    squares = np.array([(np.arctanh(pearson_without(scene)) - fisher_z) ** 2 for scene in range(7)])
     variance = ((room_sizes - 1) / room_sizes * squares).sum()
-    assert bounds(relation.pearson) == pytest.approx(around(relation.pearson.mean, variance, 7 - 2))
+    assert bounds(relation.pearson) == pytest.approx(np.tanh(around(fisher_z, variance, 7 - 2)))
 
 
 def test_only_success_that_follows_similarity_correlates():
@@ -259,9 +260,9 @@ def test_the_interval_of_gains_is_that_of_a_plain_loop():
         return np.asarray(linregress(similarities, gains))
 
     slope = left_out(lambda *omitted: 0.1 * line_without(*omitted)[0], num_scenes, num_runs, arms=2)
-    pearson = left_out(lambda *omitted: line_without(*omitted)[2], num_scenes, num_runs, arms=2)
+    fisher_z = left_out(lambda *omitted: np.arctanh(line_without(*omitted)[2]), num_scenes, num_runs, arms=2)
     assert bounds(relation.slope) == pytest.approx(slope)
-    assert bounds(relation.pearson) == pytest.approx(pearson)
+    assert bounds(relation.pearson) == pytest.approx(np.tanh(fisher_z))
 
 
 def test_runs_that_disagree_widen_the_interval_of_the_slope():
