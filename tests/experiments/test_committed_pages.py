@@ -109,7 +109,7 @@ def test_pages_can_be_written_from_the_first_result_on(name, tmp_path):
 # Agents of the tables
 
 
-@pytest.mark.parametrize("name", ["table2", "table2_earlier"])
+@pytest.mark.parametrize("name", ["table2", "real"])
 def test_table_2_has_the_methods_of_the_paper(name):
     # Beside them are layout-blind agents, EOTP adapted to ever changing scenes, and further seeds of ORG.
     methods = set(COMMITTED[name].agents) - {"anonymous", "eotp:ADAPTED", "org-again"}
@@ -127,11 +127,11 @@ def test_table_2_has_the_methods_of_the_paper(name):
             assert f"{run.agent}-streams" in methods
 
 
-@pytest.mark.parametrize("name", ["table2", "table2_earlier", "table3", "ablations", "real", "real_homes"])
+@pytest.mark.parametrize("name", ["table2", "table3", "ablations", "real", "real_homes"])
 def test_all_methods_of_a_world_learn_from_as_many_steps(name):
     runs_by_world: dict[str, list] = {}
     for run in agent_runs(COMMITTED[name]):
-        if run.agent != "semexp:NEAREST":  # it learns nothing
+        if run.agent not in ("semexp:NEAREST", "belief"):  # one learns nothing, the other fits predictors
             runs_by_world.setdefault(run.world, []).append(run)
     for runs in runs_by_world.values():
         assert len({total_steps([run]) for run in runs}) == 1
