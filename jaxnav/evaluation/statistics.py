@@ -337,8 +337,7 @@ def correlation_interval(replicates: np.ndarray, scenes: Clusters, runs: Cluster
     # A correlation of 1, as that of two points, has no finite z.
     fisher_z = np.arctanh(np.clip(replicates, -_MAX_CORRELATION, _MAX_CORRELATION))
     interval = jackknife_interval(fisher_z, scenes, runs)
-    estimate = float(np.atleast_2d(replicates)[0, 0])
-    return Interval(estimate, math.tanh(interval.low), math.tanh(interval.high))
+    return Interval(math.tanh(interval.mean), math.tanh(interval.low), math.tanh(interval.high))
 
 
 def scene_clusters(plans: np.ndarray, rooms: np.ndarray, counts: np.ndarray | None = None) -> Clusters:

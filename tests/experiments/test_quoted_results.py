@@ -11,7 +11,7 @@ from jaxnav.experiments.pages import READING_MARK
 
 ROOT = Path(__file__).parents[2]
 #: A mean with its interval, such as `3.2 [1.4, 5.1]`, `81 [64, 97]`, `39.4 % [35.0, 43.8]` or `+0.1 [-1.5, +1.6]`.
-INTERVAL = re.compile(r"([-+]?[\d.]+)(?: ?%)?(?: points)? \[([-+]?[\d.]+), ([-+]?[\d.]+)\]")
+INTERVAL = re.compile(r"(?<![\w.])([-+]?[\d.]+)(?: ?%)?(?: points)? \[([-+]?[\d.]+), ([-+]?[\d.]+)\]")
 #: Texts whose numbers are results, beside the texts that people write on the pages of experiments.
 SUMMARIES = ("README.md", "docs/results.md")
 
@@ -72,7 +72,7 @@ def written_texts() -> dict[str, str]:
     texts = {}
     for name in SUMMARIES:
         lines = (ROOT / name).read_text().splitlines()
-        texts[name] = "\n".join(line for line in lines if "`make run`" not in line and "float32" not in line)
+        texts[name] = "\n".join(line for line in lines if "`make run`" not in line)
     for path in sorted((ROOT / "docs").glob("*.md")):
         parts = path.read_text().split(READING_MARK)
         if len(parts) == 3:

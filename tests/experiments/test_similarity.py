@@ -10,6 +10,7 @@ from support.episodes import episodes_in
 from support.intervals import around, bounds, left_out
 
 from jaxnav.evaluation.episodes import EpisodeList
+from jaxnav.evaluation.statistics import correlation_interval, scene_clusters
 from jaxnav.experiments.similarity import (
     SimilarityPoints,
     compute_similarity_points,
@@ -329,3 +330,10 @@ def test_both_relations_are_read_back_from_a_file_of_rows(tmp_path):
             np.testing.assert_allclose(getattr(read, name), getattr(expected, name), rtol=1e-6)
         for name in intervals:
             assert bounds(getattr(read, name)) == pytest.approx(bounds(getattr(expected, name)), rel=1e-6)
+
+
+def test_the_interval_of_a_perfect_correlation_is_finite():
+    # All leave-one-out correlations are 1, so the interval has no width.
+    replicates = np.ones((1, 1 + 5))
+    interval = correlation_interval(replicates, scene_clusters(np.arange(5), np.zeros(5, int)))
+    assert bounds(interval) == pytest.approx((1.0, 1.0, 1.0))
