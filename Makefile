@@ -54,9 +54,9 @@ lint: $(READY)
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-# Every warning, such as a broken link, is an error.
+# Every warning, such as a broken link, is an error, but mkdocs does not count warnings that `--quiet` hides.
 docs: $(READY)
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 
 test: lint docs
 	$(BIN)/python -m pytest -n 2
