@@ -88,7 +88,7 @@ def render_page(
         "config": config,
         "table": table,
         "tables": tables,
-        "runs": _runs_with_results(config, table),
+        "runs": _runs_with_results(config, tables.values()),
         "summary": READING_MARK + summary + READING_MARK,
         "missing": missing,
         "figure": functools.partial(_draw_figure, document),
@@ -162,10 +162,13 @@ def _fault_position(error: Exception, template: str) -> str:
     return f"{frames[-1].filename}, line {frames[-1].lineno}" if frames else template
 
 
-def _runs_with_results(config: ExperimentConfig, table: ResultTable) -> dict[str, dict[str, AgentRun]]:
-    """Runs that have results, by world and agent."""
-    # The name of a run that hands over to another begins with the name of its agent.
-    measured = {(row.world, row.run.partition(",")[0]) for row in table.rows}
+def _runs_with_results(config: ExperimentConfig, tables: Iterable[ResultTable]) -> dict[str, dict[str, AgentRun]]:
+    """Runs that have results on any split, by world and agent."""
+    measured = set()
+    for table in tables:
+        for row in table.rows:
+            # The name of a run that hands over to another begins with the name of its agent.
+            measured.add((row.world, row.run.partition(",")[0]))
     all_runs = agent_runs(config)
     runs: dict[str, dict[str, AgentRun]] = {world: {} for world in (*config.folds, *config.worlds)}
     for run in all_runs + join_folds(config, all_runs):

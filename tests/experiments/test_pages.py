@@ -384,6 +384,38 @@ def test_epsilon_is_chosen_on_val_and_applied_on_test(tmp_path):
     assert "40.0" in chosen_lines[0]
 
 
+@pytest.mark.parametrize("template", ["methods", "factors"])
+@pytest.mark.parametrize("split", ["val", "test"])
+def test_pages_compare_both_splits_and_judge_gains_on_test(tmp_path, template, split):
+    # w gains 5 points on `val`; on `test` it loses 3.
+    agents = {"anonymous": {"method": "anonymous", "arms": ["baseline"]}, "org": {"against": ["anonymous"]}}
+    if template == "factors":
+        agents = {"base": {"arms": ["baseline"]}, "org": {"arms": ["layout"], "against": ["base/baseline"]}}
+    reference = {"methods": "baseline", "factors": "base/baseline"}[template]
+    tables = {}
+    for name, effect in (("val", make_interval(5.0)), ("test", make_interval(-3.0))):
+        rows = [*make_agent_rows("rooms", "org", layout=70.0 + effect.mean)]
+        rows.append(make_effect("rooms", "org", "layout", reference, effect))
+        tables[name] = ResultTable(rows)
+    config = ExperimentConfig(agents=agents, shifts=(0.0,), split=split)
+    text = render_page(tmp_path / "page.md", template, config, tables, [])
+    parts = text.split("Split `test`, evaluated once")
+    assert len(parts) == 2
+
+    # All other tables are about `val`, whichever split was measured last.
+    assert "of the split `val`" in parts[0]
+    assert "+5.0" in parts[0]
+    assert "-3.0" not in parts[0]
+    test_lines = [line for line in parts[1].splitlines() if "-3.0 [-4.0, -2.0]" in line]
+    assert len(test_lines) == 1
+    assert "refuted" in test_lines[0]
+
+    # Results of one split alone are those of the page, without the section.
+    text = render_page(tmp_path / "page.md", template, config, {split: tables[split]}, [])
+    assert "evaluated once" not in text
+    assert f"of the split `{split}`" in text
+
+
 # Removal in a mixed population
 
 
