@@ -57,11 +57,11 @@ def test_study_help_lists_experiments_and_settings(capsys):
 
 
 def test_a_smaller_version_is_an_experiment_of_its_own(capsys):
-    assert parse_study(["study", "--config", "quick", "--episodes", "7"]) == parse_study(
-        ["study_quick", "--episodes", "7"]
+    assert parse_study(["study", "--config", "rooms", "--episodes", "7"]) == parse_study(
+        ["study_rooms", "--episodes", "7"]
     )
     assert study("study", "--config", "quik") == 2
-    assert "--config quik: is unknown; choose from ithor, quick" in refusal(capsys)
+    assert "--config quik: is unknown; choose from ithor, rooms" in refusal(capsys)
     assert study("table3", "--config", "quick") == 2
     assert "table3 has no other version; omit --config" in refusal(capsys)
 

@@ -10,10 +10,9 @@ import pytest
 from rich.console import Console
 from support.tiers import params_by_tier
 
-from jaxnav.cli.study import parse_study
 from jaxnav.experiments import pages
 from jaxnav.experiments.bench import Bench
-from jaxnav.experiments.config import EXPERIMENTS, ExperimentConfig, agent_runs
+from jaxnav.experiments.config import EXPERIMENTS, ExperimentConfig, agent_runs, check_experiment
 from jaxnav.experiments.driver import Part, list_parts, write_pages
 from jaxnav.experiments.pages import READING_MARK, total_steps
 from jaxnav.experiments.table import read_part, write_part
@@ -25,8 +24,9 @@ ROOT = Path(__file__).parents[2]
 #: Experiments with results of their own; all others measure a run that is given.
 COMMITTED: dict[str, ExperimentConfig] = {}
 for _name in EXPERIMENTS:
-    if apply_yaml(ExperimentConfig(), _name, EXPERIMENTS).results != ExperimentConfig().results:
-        COMMITTED[_name] = parse_study([_name])
+    _config = apply_yaml(ExperimentConfig(), _name, EXPERIMENTS)
+    if _config.results != ExperimentConfig().results:
+        COMMITTED[_name] = check_experiment(_config)
 
 
 @pytest.fixture(autouse=True)

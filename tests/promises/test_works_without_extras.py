@@ -43,7 +43,7 @@ def test_every_name_and_help_works_without_extras(tmp_path):
 
 
 #: Commands that draw.
-DRAWING_COMMANDS = ["episode run", "report run", "scenes show rooms", "study study_quick"]
+DRAWING_COMMANDS = ["episode run", "report run", "scenes show rooms", "study study_rooms"]
 
 
 @pytest.mark.parametrize("command", params_by_tier(DRAWING_COMMANDS, fast=DRAWING_COMMANDS[:1], slow=DRAWING_COMMANDS))
