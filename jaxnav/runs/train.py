@@ -132,7 +132,8 @@ TrainCallback = Callable[[Sequence[LogRow]], None]
 def train(config: RunConfig, console: Console | None = None, callback: TrainCallback | None = None) -> Run:
     """Train a run and export its policies.
 
-    Training resumes from the last checkpoint of the run directory if there is one.
+    Training resumes from the last checkpoint of the run directory if there is one. A script calls this below
+    `if __name__ == "__main__":`, because many scenes are compiled in several processes that import the script.
 
     Args:
       config: configuration of the run.
