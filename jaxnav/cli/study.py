@@ -15,8 +15,8 @@ DESCRIPTION = (
     "needs no option, except for account, cde, handover, instrument and mixture, which measure a finished run: give "
     "--run RUN, and --reference RUN with a run of layout-blind agents (--method anonymous). `jaxnav list experiments` "
     "describes the names, and how much each one trains. `jaxnav study NAME --config quick` runs the smaller experiment "
-    "NAME_quick, where there is one. The options change an experiment; their defaults are "
-    "shown for the experiment that you give: jaxnav study table2 --help."
+    "NAME_quick, where there is one, and `--config VERSION` any NAME_VERSION. The options change an "
+    "experiment; their defaults are shown for the experiment that you give: jaxnav study table2 --help."
 )
 
 
