@@ -1,10 +1,12 @@
 """Pages of experiments: Markdown templates, filled from the result table by Jinja.
 
 A template is Markdown with expressions such as `{{ table.find(world="rooms", run="org", ...) | f(".1f") }}`.
-`render_page` gives it the experiment (`config`), the results (`table`, and `tables` by split), the agents, and the
-functions of this module. The summary of a page, between two `<!-- reading -->` marks, is written by hand and kept.
+`render_page` gives it the experiment (`config`), the `split` that the page is about with its results (`table`), the
+results of every split (`tables`), the agents, and the functions of this module. The summary of a page, between two
+`<!-- reading -->` marks, is written by hand and kept.
 """
 
+import dataclasses
 import functools
 import math
 import traceback
@@ -32,7 +34,7 @@ READING_MARK = "<!-- reading -->"
 #: Before and after the tables of a page that `jaxnav study` prints.
 RESULT_MARK = "<!-- result -->"
 #: Names that a template is given; see docs/experiments.md.
-CONTEXT_NAMES = frozenset(("config", "table", "tables", "runs", "summary", "missing", "figure"))
+CONTEXT_NAMES = frozenset(("config", "split", "table", "tables", "runs", "summary", "missing", "figure"))
 
 
 def check_page(document: Path, template: str) -> None:
@@ -83,10 +85,12 @@ def render_page(
     if document.exists():
         summary = document.read_text(encoding="utf-8").split(READING_MARK)[1]
 
-    table = tables.get(config.split, ResultTable([]))
+    # Choices are made on `val`, so a page is about `val` where it is measured.
+    split = "val" if "val" in tables else config.split
     context = {
         "config": config,
-        "table": table,
+        "split": split,
+        "table": tables.get(split, ResultTable([])),
         "tables": tables,
         "runs": _runs_with_results(config, tables.values()),
         "summary": READING_MARK + summary + READING_MARK,
@@ -135,6 +139,7 @@ def _load_template(template: str) -> jinja2.Template:
         "chooses_actions": chooses_actions,
         "requested_steps": requested_steps,
         "total_steps": total_steps,
+        "differ_only_in_layout": differ_only_in_layout,
         "difference_of_worlds": difference_of_worlds,
         "effect_cells": effect_cells,
         "merge": merge_fields,
@@ -273,3 +278,9 @@ def requested_steps(run: AgentRun) -> int:
 def total_steps(runs: Iterable[AgentRun]) -> int:
     """Environment steps of the longest training among runs."""
     return max(run.config.total_updates * run.config.steps_per_update for run in runs)
+
+
+def differ_only_in_layout(run: AgentRun, other: AgentRun) -> bool:
+    """True if two runs have the same settings, apart from their arms and the layout that these are given."""
+    given = other.config
+    return dataclasses.replace(run.config, run_dir=given.run_dir, arms=given.arms, layout=given.layout) == given

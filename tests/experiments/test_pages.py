@@ -582,13 +582,26 @@ def test_claims_of_the_study_on_idle_experience_have_no_verdict(tmp_path):
 
 
 def test_agents_of_factors_have_their_decision_share(tmp_path):
-    agents = {"base": {"arms": ["baseline"]}, "w": {"arms": ["layout"], "against": ["base/baseline"]}}
+    agents = {
+        "base": {"arms": ["baseline"]},
+        "w": {"arms": ["layout"], "against": ["base/baseline"]},
+        "gate+w": {"arms": ["layout"], "done_gate": True, "against": ["w/layout"]},
+    }
     config = ExperimentConfig(agents=agents, shifts=(0.0,))
-    rows = [*make_agent_rows("rooms", "base", baseline=50.0), *make_agent_rows("rooms", "w", layout=60.0)]
+    rows = [*make_agent_rows("rooms", "base", baseline=50.0)]
+    rows += [*make_agent_rows("rooms", "w", layout=60.0), *make_agent_rows("rooms", "gate+w", layout=70.0)]
+    rows.append(make_effect("rooms", "w", "layout", "base/baseline", make_interval(10.0)))
+    rows.append(make_effect("rooms", "gate+w", "layout", "w/layout", make_interval(10.0)))
     shares = [make_share("base", "baseline", 3.0), make_share("w", "layout", 8.0)]
     cells = read_lines(render(tmp_path, "factors", *rows, *shares, config=config))
     assert cells["`base`"][-1] == "3.0 [2.0, 4.0]"
     assert cells["`w`"][-1] == "8.0 [7.0, 9.0]"
+    assert cells["`w` over `base`"][0] == "holds"
+    # Below 5 %, an effect of the layout alone has no verdict; that of another part has one.
+    idle_shares = [make_share(agent, agents[agent]["arms"][0], 4.0) for agent in agents]
+    cells = read_lines(render(tmp_path, "factors", *rows, *idle_shares, config=config))
+    assert "experience is idle" in cells["`w` over `base`"][0]
+    assert cells["`gate+w` over `w`"][0] == "holds"
     # Earlier results have no shares, and the table no column.
     assert len(read_lines(render(tmp_path, "factors", *rows, config=config))["`w`"]) == len(cells["`w`"]) - 1
 
