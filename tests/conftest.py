@@ -1,4 +1,4 @@
-"""Settings of the whole suite: no silent promotion of dtypes or ranks, no cache between runs, reproducible examples."""
+"""Settings of the whole suite: no silent promotion of dtypes or ranks, a cache of its own, reproducible examples."""
 
 import atexit
 import gc
@@ -10,10 +10,11 @@ from pathlib import Path
 
 # JAX reads these when it is imported, here, in the suite's other workers and in the commands that tests start.
 if "PYTEST_XDIST_WORKER" not in os.environ:
-    # What one test has compiled another need not; nothing is kept from one run to the next.
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="jaxnav-tests-")
+    # What one test has compiled another need not; nothing is kept from one run to the next, unless a folder is given.
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="jaxnav-tests-")
+        atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
-    atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
     # A process that reads a program while another one writes it compiles the program itself, after a warning.
     os.environ.setdefault("PYTHONWARNINGS", "ignore:Error reading persistent compilation cache entry:UserWarning")
     # Most of the time goes into compilation, which this makes quicker; the README's commands run as users run them.
