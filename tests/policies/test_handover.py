@@ -32,12 +32,18 @@ BOTH = {"agent": AGENT, "without": WITHOUT}
 EPISODES, KEY = draw_episodes(tiny.BANK, 24, seed=1), jax.random.key(3)
 
 
-def outcome(acting, weights, row, **changes):
-    """How the episodes go."""
+def make_cells(row, **changes):
+    """The cell of a row, with something changed."""
     cells = inference_grid([row], ("layout",), 1)
-    cells = cells.replace(**{name: jnp.full_like(getattr(cells, name), value) for name, value in changes.items()})
+    return cells.replace(**{name: jnp.full_like(getattr(cells, name), value) for name, value in changes.items()})
+
+
+def play(acting, weights, *cells):
+    """How the episodes of each cell go, all compiled as one program."""
+    grid = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *cells)
     stacked = jax.tree.map(lambda leaf: leaf[None], weights)
-    return Evaluator(acting)(cells, stacked, [(EPISODES, PARAMS)], KNOWLEDGE, KEY)
+    outcome = Evaluator(acting)(grid, stacked, [(EPISODES, PARAMS)], KNOWLEDGE, KEY)
+    return [tiny.leaves_at(outcome, index) for index in range(len(cells))]
 
 
 def alike(one, other):
@@ -45,10 +51,28 @@ def alike(one, other):
     chex.assert_trees_all_equal(one._replace(mean_weight=0), other._replace(mean_weight=0))
 
 
+LAYOUT_ROW = table_row("layout", None, None, "argmax")
+
+
 @pytest.fixture(scope="module")
 def layout_blind():
     """Episodes of the layout-blind policy, which wears the name of the one arm that is there."""
-    return outcome(ALONE, WITHOUT, table_row("layout", None, None, "argmax"))
+    return play(ALONE, WITHOUT, make_cells(LAYOUT_ROW))[0]
+
+
+@pytest.fixture(scope="module")
+def handed_over():
+    """Episodes of the pair: never handed over, under TDE, handed over at the first step, and two steps later."""
+    switch = table_row("stde", 0.5, "switch", "argmax")
+    given = {"gap_source": GapSource.GIVEN, "given_gap": 1.0, "gap_end": 2**30}
+    return play(
+        PAIR,
+        BOTH,
+        make_cells(LAYOUT_ROW),
+        make_cells(table_row("tde", None, None, "argmax")),
+        make_cells(switch, gap_begin=0, **given),
+        make_cells(switch, gap_begin=2, **given),
+    )
 
 
 def test_what_removal_leaves_is_the_layout_blind_policy_to_the_bit():
@@ -74,23 +98,21 @@ def test_what_removal_leaves_is_the_layout_blind_policy_to_the_bit():
 
 
 @pytest.mark.slow
-def test_without_removal_the_policy_with_experience_acts():
-    row = table_row("layout", None, None, "argmax")
-    alike(outcome(PAIR, BOTH, row), outcome(AgentLoop(ENV, tiny.SPEC, tiny.ESTIMATOR), AGENT, row))
+def test_without_removal_the_policy_with_experience_acts(handed_over):
+    (alone,) = play(AgentLoop(ENV, tiny.SPEC, tiny.ESTIMATOR), AGENT, make_cells(LAYOUT_ROW))
+    alike(handed_over[0], alone)
 
 
 @pytest.mark.slow
-def test_under_tde_the_layout_blind_policy_acts(layout_blind):
-    alike(outcome(PAIR, BOTH, table_row("tde", None, None, "argmax")), layout_blind)
+def test_under_tde_the_layout_blind_policy_acts(handed_over, layout_blind):
+    alike(handed_over[1], layout_blind)
 
 
 @pytest.mark.slow
-def test_handed_over_at_the_first_step_it_is_the_same(layout_blind):
-    switch = table_row("stde", 0.5, "switch", "argmax")
-    at_once = outcome(PAIR, BOTH, switch, gap_source=GapSource.GIVEN, given_gap=1.0, gap_begin=0, gap_end=2**30)
+def test_handed_over_at_the_first_step_it_is_the_same(handed_over, layout_blind):
+    _, _, at_once, later = handed_over
     alike(at_once, layout_blind)
     # Two steps later it is neither of the two, but begins as the one with experience.
-    later = outcome(PAIR, BOTH, switch, gap_source=GapSource.GIVEN, given_gap=1.0, gap_begin=2, gap_end=2**30)
     assert (np.asarray(later.length) != np.asarray(at_once.length)).any()
     assert (np.asarray(later.mean_weight) > 0).any()
     assert (np.asarray(later.mean_weight) < 1).all()
@@ -174,10 +196,11 @@ def test_under_cde_episodes_are_those_of_the_network_without_experience():
     first_row = sum(policy.widths[:2])
     mute_kernel = kernel.at[first_row : first_row + policy.widths[2]].set(0.0)
     mute = AGENT | {"fuse": AGENT["fuse"] | {"kernel": mute_kernel}}
-    removed = outcome(OWN_PAIR, AGENT, table_row("cde", None, None, "argmax"))
-    alike(removed, outcome(AgentLoop(ENV, DROPPING, tiny.ESTIMATOR), mute, table_row("layout", None, None, "argmax")))
+    cde_row = table_row("cde", None, None, "argmax")
+    removed, plain = play(OWN_PAIR, AGENT, make_cells(cde_row), make_cells(LAYOUT_ROW))
+    (muted,) = play(AgentLoop(ENV, DROPPING, tiny.ESTIMATOR), mute, make_cells(LAYOUT_ROW))
+    alike(removed, muted)
     # Negative control: with experience the episodes differ.
-    plain = outcome(OWN_PAIR, AGENT, table_row("layout", None, None, "argmax"))
     assert (np.asarray(plain.length) != np.asarray(removed.length)).any()
 
 
