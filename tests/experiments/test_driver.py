@@ -325,6 +325,7 @@ shifts: [0.0]
 episodes: 24
 base:
   seeds: 2
+  arms: [layout]
 {base}""",
     )
     assert command.main([str(path)]) == 0
