@@ -65,14 +65,13 @@ def handed_over():
     """Episodes of the pair: never handed over, under TDE, handed over at the first step, and two steps later."""
     switch = table_row("stde", 0.5, "switch", "argmax")
     given = {"gap_source": GapSource.GIVEN, "given_gap": 1.0, "gap_end": 2**30}
-    return play(
-        PAIR,
-        BOTH,
-        make_cells(LAYOUT_ROW),
-        make_cells(table_row("tde", None, None, "argmax")),
-        make_cells(switch, gap_begin=0, **given),
-        make_cells(switch, gap_begin=2, **given),
-    )
+    cells = {
+        "never": make_cells(LAYOUT_ROW),
+        "TDE": make_cells(table_row("tde", None, None, "argmax")),
+        "at once": make_cells(switch, gap_begin=0, **given),
+        "later": make_cells(switch, gap_begin=2, **given),
+    }
+    return dict(zip(cells, play(PAIR, BOTH, *cells.values()), strict=True))
 
 
 def test_what_removal_leaves_is_the_layout_blind_policy_to_the_bit():
@@ -100,17 +99,17 @@ def test_what_removal_leaves_is_the_layout_blind_policy_to_the_bit():
 @pytest.mark.slow
 def test_without_removal_the_policy_with_experience_acts(handed_over):
     (alone,) = play(AgentLoop(ENV, tiny.SPEC, tiny.ESTIMATOR), AGENT, make_cells(LAYOUT_ROW))
-    alike(handed_over[0], alone)
+    alike(handed_over["never"], alone)
 
 
 @pytest.mark.slow
 def test_under_tde_the_layout_blind_policy_acts(handed_over, layout_blind):
-    alike(handed_over[1], layout_blind)
+    alike(handed_over["TDE"], layout_blind)
 
 
 @pytest.mark.slow
 def test_handed_over_at_the_first_step_it_is_the_same(handed_over, layout_blind):
-    _, _, at_once, later = handed_over
+    at_once, later = handed_over["at once"], handed_over["later"]
     alike(at_once, layout_blind)
     # Two steps later it is neither of the two, but begins as the one with experience.
     assert (np.asarray(later.length) != np.asarray(at_once.length)).any()

@@ -97,9 +97,10 @@ def test_experience_coin_is_constant_within_an_episode():
         np.testing.assert_array_equal(next_rollout.initial_memory.use_experience[running], last_coins[running])
 
 
-@pytest.mark.slow
-def test_experience_coin_has_the_configured_probability():
-    experience_prob = 0.25
+@pytest.mark.parametrize(
+    "experience_prob", [pytest.param(0.25, marks=pytest.mark.slow), pytest.param(0.8, marks=pytest.mark.exhaustive)]
+)
+def test_experience_coin_has_the_configured_probability(experience_prob):
     learner = make_learner("org", experience=experience_prob)
     learner = dataclasses.replace(learner, config=dataclasses.replace(learner.config, num_envs=1024))
 
@@ -121,9 +122,15 @@ def test_experience_coin_has_the_configured_probability():
     np.testing.assert_array_equal(last_coins[~is_new_episode], first_coins[~is_new_episode])
 
 
-@pytest.mark.slow
-def test_experience_coin_changes_within_an_episode_if_drawn_every_step():
-    learner = make_learner("org", experience=0.5, experience_drawn="step")
+@pytest.mark.parametrize(
+    ("drawn", "expected_share"),
+    [
+        pytest.param("step", pytest.approx(0.5, abs=0.25), marks=pytest.mark.slow),
+        pytest.param("episode", 0.0, marks=pytest.mark.exhaustive),
+    ],
+)
+def test_experience_coin_changes_within_an_episode_only_if_drawn_every_step(drawn, expected_share):
+    learner = make_learner("org", experience=0.5, experience_drawn=drawn)
     state = jax.jit(learner.init)(jax.random.key(0), PARAMS, KNOWLEDGE)
     coins_before = np.asarray(state.agent.memory.use_experience)
     scalars = learner.config.scalars(num_updates=1)
@@ -133,7 +140,7 @@ def test_experience_coin_changes_within_an_episode_if_drawn_every_step():
     is_same_episode = np.asarray(agent_after.state.time) == LENGTH
     assert is_same_episode.sum() > ENVS / 4
     coin_changed = agent_after.memory.use_experience[is_same_episode] != coins_before[is_same_episode]
-    assert coin_changed.mean() == pytest.approx(0.5, abs=0.25)
+    assert coin_changed.mean() == expected_share
 
 
 # Stages
