@@ -38,11 +38,14 @@ hypothesis.settings.load_profile("jaxnav")
 
 
 class ByFixtures(LoadScopeScheduling):
-    """Keep together what shares fixtures: the tests of a file, all of `runs`, of `cli` and of `experiments`."""
+    """Keep together what shares fixtures: the tests of a file, all of `runs` and `cli`, and all of `experiments`."""
 
     def _split_scope(self, nodeid: str) -> str:
-        file, folder = nodeid.partition("::")[0], Path(nodeid.partition("::")[0]).parent
-        return str(folder) if folder.name in ("runs", "cli", "experiments") else file
+        file = nodeid.partition("::")[0]
+        folder_name = Path(file).parent.name
+        if folder_name in ("runs", "cli"):
+            return "runs and cli"
+        return folder_name if folder_name == "experiments" else file
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -107,6 +107,7 @@ def test_notebook_finds_the_kettle_only_in_the_training_layout():
     assert max(rates[4:]) < min(rates[:4])
 
 
+@pytest.mark.slow
 def test_own_detections_example_raises_the_gap_for_new_pairs(tmp_path):
     """What was never seen together moves the belief more than what was."""
     gaps = [float(gap) for gap in re.findall(r"gap ([\d.]+)", run_example("own_detections", tmp_path))]

@@ -114,6 +114,7 @@ def test_frontier_success_counts_at_the_step_limit():
         assert (bool(result.success[0]), int(result.length[0])) == (has_success, step_limit)
 
 
+@pytest.mark.slow
 @settings(max_examples=20)
 @given(seed=st.integers(0, 7), start_pose=st.integers(0, 10_000), goal=st.sampled_from([BOOK, CHAIR]))
 def test_frontier_walk_depends_on_perception_alone(seed, start_pose, goal):

@@ -262,6 +262,7 @@ def test_import_refuses_options_of_other_formats(tmp_path, capsys, format_name, 
     assert_message_names(refusal(capsys), *problem.split("; "))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene_format", FORMATS)
 def test_import_of_mutated_files_neither_crashes_nor_leaves_partial_files(scene_format, capsys):
     exit_codes, _ = fuzz(scene_format, 40)

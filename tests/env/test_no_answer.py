@@ -62,6 +62,7 @@ def test_find_leaks_flags_success_bits_planted_in_the_rows(world):
     assert len(leaks.goals) >= 0.75 * leaks.num_goals
 
 
+@pytest.mark.slow
 @all_worlds
 def test_reset_and_step_observe_a_state_alike(world):
     _, env, params = build_world(world)

@@ -171,6 +171,7 @@ def test_shaping_leaves_the_reward_of_done(rules, goal_distance):
     assert reward == 5.0
 
 
+@pytest.mark.slow
 @both_measures
 def test_without_shaping_a_step_nearer_pays_nothing(rules):
     _, env, params, state = corridor_with_shaping(rules, shaping=0.0)

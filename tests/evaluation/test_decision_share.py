@@ -79,6 +79,7 @@ def test_a_decision_changes_if_its_best_action_does_and_kl_exceeds_the_bound():
     assert not changed((0.98, 0.02), (0.51, 0.49))
 
 
+@pytest.mark.slow
 def test_a_policy_that_ignores_experience_has_shares_of_zero(probe):
     counts, shares = probe(ignore_experience)
     experience_parts = (ReplacedPart.OTHER_CATEGORIES, *PARTS[1:4])

@@ -50,6 +50,7 @@ def make_episode(action, success=False, shift=0.0, variant: PlayedVariant = "std
     )
 
 
+@pytest.mark.slow
 def test_gif_has_a_frame_per_step(tmp_path):
     episode = make_episode([0, 1, 2, 1, 0, DONE])
     draw_episode([episode], tmp_path / "new" / "a.gif")
@@ -60,6 +61,7 @@ def test_gif_has_a_frame_per_step(tmp_path):
         assert gif.size == png.size == (520, 680)
 
 
+@pytest.mark.slow
 def test_shorter_panel_stands_still_after_its_end(tmp_path):
     """The left half stands still from its third frame on, while the right one goes on to its sixth."""
     short_episode, long_episode = make_episode([1, 1, DONE], success=True), make_episode([1, 1, 2, 1, 1, 0], shift=1.0)
@@ -84,6 +86,7 @@ def test_shorter_panel_stands_still_after_its_end(tmp_path):
     assert durations[-1] >= 1000 > max(durations[:-1])
 
 
+@pytest.mark.slow
 def test_each_variant_has_a_row_of_panels(tmp_path):
     episodes = []
     variants: tuple[PlayedVariant, ...] = ("layout", "scde")

@@ -103,6 +103,7 @@ def test_noise_control_has_the_spread_of_the_counterfactual_logits(agent):
     assert abs(np.corrcoef(np.asarray(result).ravel(), np.asarray(counterfactual).ravel())[0, 1]) < 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", [ReplacedPart.EXPERIENCE, ReplacedPart.MEMORY])
 def test_controls_take_a_part_of_the_counterfactual_decision_from_another_episode(agent, part):
     """The factual decision stays, and the removed logits are those with the partner's part."""

@@ -52,6 +52,7 @@ def copy_documents(config: ExperimentConfig, folder: Path) -> ExperimentConfig:
     return dataclasses.replace(config, pages=copies)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", COMMITTED)
 def test_committed_documents_are_written_from_the_committed_results(name, tmp_path):
     config = COMMITTED[name]
@@ -77,6 +78,7 @@ def test_every_committed_file_of_results_belongs_to_an_experiment():
     assert committed_paths <= known_paths
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", COMMITTED)
 def test_committed_results_are_written_as_they_were_read(name, tmp_path):
     for path in sorted(COMMITTED[name].results.rglob("*.jsonl")):

@@ -202,6 +202,7 @@ def test_the_effects_figure_fills_markers_whose_interval_excludes_zero():
     assert first.texts[0].get_text() == "+3.0 [+2.0, +4.0]"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", params_by_tier(DRAWINGS, fast=["epsilon"], slow=DRAWINGS))
 def test_equal_data_gives_equal_bytes(name, tmp_path):
     figure = DRAWINGS[name]()

@@ -263,6 +263,7 @@ def test_each_episode_of_a_batch_adapts_as_it_does_alone():
     np.testing.assert_allclose(single_logits, logits[:, 2], rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_adaptation_steps_only_at_the_ends_of_the_first_four_windows():
     adaptation = LearnedLossAdaptation(learning_rate=LEARNING_RATE)
     run_adapted = jax.jit(functools.partial(run_package, SAVN, tiny.random_params(0, SAVN), adaptation))

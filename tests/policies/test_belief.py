@@ -369,6 +369,7 @@ def make_snapshot(rng):
     )
 
 
+@pytest.mark.slow
 def test_losses_are_negative_log_likelihoods_of_the_goals_squares():
     snapshot = make_snapshot(np.random.default_rng(3))
     policy = bind(SPECS[BELIEF], random_policy_params())
@@ -389,6 +390,7 @@ def test_losses_are_negative_log_likelihoods_of_the_goals_squares():
     np.testing.assert_allclose([places_loss, layout_loss], expected, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_fit_finds_what_stands_near_what(monkeypatch):
     """Books stand next to chairs: the fit makes squares near chairs likelier, for the layout and not for the places."""
     rng = np.random.default_rng(4)

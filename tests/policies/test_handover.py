@@ -74,6 +74,7 @@ def handed_over():
     return dict(zip(cells, play(PAIR, BOTH, *cells.values()), strict=True))
 
 
+@pytest.mark.slow
 def test_what_removal_leaves_is_the_layout_blind_policy_to_the_bit():
     decider = PAIR.bind_decider(BOTH)
     batch = jnp.arange(8)
@@ -136,9 +137,13 @@ def follow_alone(policy, inputs_by_step, actions, use_experience):
     return logits
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method_name",
-    ["org", *(pytest.param(f"support.methods:{name}", marks=pytest.mark.slow) for name in ("ATTENTIVE", "ADAPTIVE"))],
+    [
+        "org",
+        *(pytest.param(f"support.methods:{name}", marks=pytest.mark.exhaustive) for name in ("ATTENTIVE", "ADAPTIVE")),
+    ],
 )
 def test_reference_removal_leaves_the_network_without_experience_to_the_bit(method_name):
     """At s = 1, at every step of an episode: eq. 1 leaves a0, whose memory has never held experience."""

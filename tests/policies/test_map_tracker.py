@@ -118,6 +118,7 @@ def test_the_cells_of_a_view_are_those_of_the_training_homes():
         jax.tree.map(np.testing.assert_array_equal, table, make_view_table(rules, ROWS.view))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", ["rooms", "apartments", "houses"])
 def test_maps_of_random_walks_agree_with_the_home(world):
     """With a detector without errors every mark is where an object of its category stands."""

@@ -202,6 +202,7 @@ def test_rgb_has_no_experience():
 # Parameters
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_init_params_gives_nested_dicts_that_bind_takes_over(method):
     spec = PolicySpec(method=find_method(method), num_categories=NUM_CATEGORIES, sizes=SIZES)

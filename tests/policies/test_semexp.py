@@ -130,6 +130,7 @@ def choice_ahead(num_lines):
 # The walk and Done
 
 
+@pytest.mark.slow
 def test_control_looks_down_walks_north_and_says_done_near_a_confirmed_goal():
     walk = walk_corridor(make_start_state(10, NORTH), [choice_ahead(10)] * 60)
     # From line 10 to the first within 1.45 m of the book in line 23, 5.75 m: 4.5 m is line 18. Eight steps.
@@ -150,6 +151,7 @@ def test_control_says_done_only_after_a_second_pose_confirms_the_goal():
 # Decision steps
 
 
+@pytest.mark.slow
 def test_control_ignores_choices_between_decision_steps():
     is_decision_step = LocalPolicy().is_decision_step
     start_state = make_start_state(2, SOUTH, FRIDGE)  # no fridge here, so that the episode goes on
@@ -164,6 +166,7 @@ def test_control_ignores_choices_between_decision_steps():
     assert constant_walk.actions[:second_decision] == varied_walk.actions
 
 
+@pytest.mark.slow
 def test_no_step_is_a_decision_while_the_goal_is_on_the_map():
     """The goal is in the first view, so no choice counts; as soon as its mark is cleared, one does."""
     local_policy = LocalPolicy()

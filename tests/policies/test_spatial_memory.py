@@ -184,6 +184,7 @@ def test_one_hot_inputs():
     np.testing.assert_array_equal(SpatialMemory.encode_surroundings(codes), np.concatenate(expected))
 
 
+@pytest.mark.slow
 def test_the_surroundings_enter_by_the_scene_alone_and_start_anew_with_an_episode():
     spec = dataclasses.replace(tiny.SPEC, spatial_memory=SpatialMemory(8))
     acting, weights = AgentLoop(ENV, spec, tiny.ESTIMATOR), tiny.random_params(0, spec)

@@ -114,9 +114,8 @@ def assert_bit_identical(actual, desired):
 # Equations 1 and 2
 
 
-@pytest.mark.parametrize(
-    "method_name", params_by_tier(HOSTS, fast=["org"], slow=["anonymous", "support.methods:ADAPTIVE", "vtnet"])
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("method_name", params_by_tier(HOSTS, slow=["anonymous", "org", "support.methods:ADAPTIVE"]))
 def test_tde_of_streams_is_bit_identical_to_the_direct_stream(method_name):
     for seed in range(4):
         decisions = random_decisions(make_spec(method_name), seed)
@@ -129,7 +128,8 @@ def test_tde_of_streams_is_bit_identical_to_the_direct_stream(method_name):
         assert np.std(decisions.counterfactual.logits) > 0.1
 
 
-@pytest.mark.parametrize("method_name", params_by_tier(HOSTS, fast=["rgb", "org"], slow=["hoz", "semexp"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("method_name", params_by_tier(HOSTS, slow=["rgb", "org"]))
 def test_stde_of_streams_keeps_a_share_of_the_experience_stream(method_name):
     decisions = random_decisions(make_spec(method_name), seed=5)
     direct_logits = decisions.direct.logits - decisions.neither.logits
@@ -139,6 +139,7 @@ def test_stde_of_streams_keeps_a_share_of_the_experience_stream(method_name):
     np.testing.assert_allclose(effect, direct_logits + kept_share[:, None] * experience_logits, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{"done_gate": True}, {"spatial_memory": SpatialMemory(4)}])
 def test_tde_of_streams_is_the_direct_stream_with_gate_and_spatial_memory(options):
     decisions = random_decisions(make_spec("org", **options), seed=3)

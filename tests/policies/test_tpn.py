@@ -101,6 +101,7 @@ def logits_of_answers(hidden, answers):
     return tentative_policy.expert(tentative_policy.both(jnp.concatenate([state, read_trials], axis=-1)))
 
 
+@pytest.mark.slow
 def test_memory_answers_as_the_released_one():
     """Along an episode longer than the memory: nothing at first, all trials up to ten, then the ten most similar."""
     hidden, actions = draw_episode(NUM_TRIALS + 30)
@@ -114,6 +115,7 @@ def test_memory_answers_as_the_released_one():
         assert np.median(np.abs(logits - mistaken).max(axis=1)) > 0.02
 
 
+@pytest.mark.slow
 def test_first_decision_of_an_episode_reads_nothing():
     hidden, actions = draw_episode(3)
     tentative_policy = make_tentative_policy()
@@ -127,6 +129,7 @@ def test_first_decision_of_an_episode_reads_nothing():
     np.testing.assert_allclose(logits, predict_along(hidden, actions)[0][0], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_memory_retrieves_what_an_action_led_to():
     """A state that returns reads the next state and the action that followed its first visit."""
     hidden, actions = draw_episode(40)
@@ -235,6 +238,7 @@ def test_actor_change_is_reset_every_fifty_decisions(num_decisions, is_kept):
     assert np.asarray(decision.fast.actor_change)[~is_repeated].any() == is_kept
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "agent_loop",
     [dataclasses.replace(AGENT_LOOP, inner_steps=0), dataclasses.replace(AGENT_LOOP, spec=UNTRIED_SPEC)],

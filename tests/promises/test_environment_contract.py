@@ -19,6 +19,7 @@ def test_generated_rooms_satisfy_the_environment_contract():
     check_environment(*build_environment(BANK, {}, 5))
 
 
+@pytest.mark.slow
 def test_imported_rooms_satisfy_the_environment_contract():
     check_environment(*build_environment(compile_bank(read_scenes(require(ITHOR))[::25], Task()), {}, 100))
 

@@ -21,7 +21,7 @@ def whole_run(tmp_path_factory):
 
 
 @pytest.mark.skipif(os.geteuid() != 0 or shutil.which("mount") is None, reason="only root mounts a file system")
-@pytest.mark.parametrize("limit", params_by_tier(LIMITS, slow=LIMITS[1::2]))
+@pytest.mark.parametrize("limit", params_by_tier(LIMITS, slow=["size=24k"]))
 def test_training_on_a_full_disk_is_one_line_and_loses_nothing(whole_run, tmp_path, limit):
     if not can_mount(tmp_path / "probe"):
         pytest.skip("no file system can be mounted here")

@@ -32,6 +32,7 @@ MANIFEST = make_manifest({})
 STATE = {"weights": jnp.arange(3.0)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", params_by_tier(NAMES, fast=NAMES[::6], slow=NAMES), ids=ascii)
 def test_checkpoints_are_stored_in_a_run_directory_of_any_name(name, tmp_path, monkeypatch):
     # The working directory has the name, too.
@@ -85,6 +86,7 @@ def test_first_checkpoint_is_read_back(tmp_path, monkeypatch):
     assert answers == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["n" * 256, "n" * 700, "é" * 350])
 def test_train_refuses_a_name_that_is_too_long_in_one_line(name, tmp_path, capsys):
     assert train(write_config(tmp_path), tmp_path / name) == 2

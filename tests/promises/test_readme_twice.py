@@ -67,6 +67,7 @@ def test_commands_of_the_readme_run_twice(tmp_path):
     assert changed_files == set()
 
 
+@pytest.mark.slow
 def test_example_of_the_readme_runs_twice(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     example, *_ = re.findall(r"```python\n(.*?)```", README, re.DOTALL)

@@ -246,12 +246,13 @@ def find_largest_array_file(checkpoint_dir):
     return max((checkpoint_dir / "state").rglob("d/*"), key=lambda path: path.stat().st_size)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "damage_checkpoint",
     [
-        pytest.param(lambda folder: (folder / "_CHECKPOINT_METADATA").write_text("{"), marks=pytest.mark.slow),
-        pytest.param(lambda folder: (folder / "state/_METADATA").unlink(), marks=pytest.mark.slow),
-        pytest.param(lambda folder: (folder / "state/_METADATA").write_text(""), marks=pytest.mark.slow),
+        pytest.param(lambda folder: (folder / "_CHECKPOINT_METADATA").write_text("{"), marks=pytest.mark.exhaustive),
+        pytest.param(lambda folder: (folder / "state/_METADATA").unlink(), marks=pytest.mark.exhaustive),
+        pytest.param(lambda folder: (folder / "state/_METADATA").write_text(""), marks=pytest.mark.exhaustive),
         lambda folder: flip_bit(find_largest_array_file(folder)),
     ],
 )
@@ -273,6 +274,7 @@ def test_restore_names_a_damaged_checkpoint_and_uses_the_one_before(tmp_path, da
     assert restore_latest(tmp_path).step == 2
 
 
+@pytest.mark.slow
 def test_restore_refuses_when_every_checkpoint_is_damaged(tmp_path):
     save_two_checkpoints(tmp_path)
     for step in (1, 2):

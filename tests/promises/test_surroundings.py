@@ -100,6 +100,7 @@ def test_a_missing_backend_is_one_line(error, monkeypatch, capsys):
     assert_message_names(capsys.readouterr().err, "error: JAX_PLATFORMS=x: ", "no such device", "unset it")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "value"),
     [("JAX_ENABLE_X64", "maybe"), ("JAX_DEFAULT_MATMUL_PRECISION", "exact"), ("JAX_NUM_CPU_DEVICES", "many")],
@@ -122,6 +123,7 @@ def test_a_bug_is_not_taken_for_a_missing_backend():
 # Figures
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("setting", ["text.usetex: True", "savefig.format: pdf", "savefig.dpi: 7", "font.size: 99"])
 def test_figures_do_not_depend_on_matplotlibrc(setting, tmp_path):
     rows = [{"arm": "layout", "env_steps": steps, "success": 0.5} for steps in (1, 2)]
@@ -155,6 +157,7 @@ def test_help_ends_at_any_width(columns, monkeypatch, capsys):
     assert "--run-dir" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("redirection", [">&-", "2>&-", "<&-", ">&- 2>&- <&-"])
 def test_commands_run_with_closed_streams(redirection):
     code, output = run_jaxnav("list", "worlds", redirection=redirection)
@@ -162,6 +165,7 @@ def test_commands_run_with_closed_streams(redirection):
     assert "Traceback" not in output
 
 
+@pytest.mark.slow
 def test_play_refuses_a_closed_input():
     code, output = run_jaxnav("play", redirection="<&-")
     assert (code, output.count("\n")) == (2, 1)
@@ -188,7 +192,8 @@ def check(environment_name, command_name, folder):
     assert find_fault(environment_name, attempt, folder) is None, attempt.output
 
 
-@pytest.mark.parametrize(("environment_name", "command_name"), params_by_tier(SAMPLE, fast=SAMPLE[::4], slow=SAMPLE))
+@pytest.mark.slow
+@pytest.mark.parametrize(("environment_name", "command_name"), SAMPLE)
 def test_surroundings_by_a_sample(environment_name, command_name, tmp_path):
     check(environment_name, command_name, tmp_path)
 

@@ -36,6 +36,7 @@ def without_pictures(script, folder):
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, env=environment)
 
 
+@pytest.mark.slow
 def test_every_name_and_help_works_without_extras(tmp_path):
     commands = [*COMMANDS, *(f"scenes {name}" for name in ("import", "show", "stats"))]
     done = without_pictures(IMPORT + HELP.replace("ALL", repr(commands)), tmp_path)

@@ -56,6 +56,7 @@ def read_scores(path):
         return json.loads(path.read_text()), list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 def test_scores_follow_from_the_stored_episodes(tiny_benchmark, tmp_path):
     scores = run_benchmark(turn_or_stop, "tiny")
     path = tmp_path / "scores.json"

@@ -154,14 +154,12 @@ def test_model_card_program_runs_with_jax_alone(drawn_run, tmp_path):
         assert fact in card
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method_name", "decision"),
     [
         ("org", "streams"),
-        *params_by_tier(
-            [(name, "streams" if name in ("savn", "sp", "vtnet") else "fused") for name in METHODS],
-            slow=[("semexp", "fused")],
-        ),
+        *params_by_tier([(name, "streams" if name in ("savn", "sp", "vtnet") else "fused") for name in METHODS]),
     ],
 )
 def test_exported_program_acts_as_its_policy(method_name, decision):

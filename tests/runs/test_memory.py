@@ -112,6 +112,7 @@ def test_count_array_bytes_counts_arrays_and_random_keys():
     assert count_array_bytes(jax.eval_shape(lambda: tree)) == 16 + 3 + 8
 
 
+@pytest.mark.slow
 def test_estimated_states_have_the_size_of_the_states(tmp_path):
     config = tiny_config(tmp_path)
     world = compile_training_world(config, PlainConsole(quiet=True))
@@ -128,6 +129,7 @@ def test_estimated_states_have_the_size_of_the_states(tmp_path):
     assert sharded_trainer.estimate_state_bytes(env_params) == num_bytes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("free_before_each_check", "message"),
     [

@@ -41,6 +41,7 @@ def test_config_for_policy_names_the_world_of_its_task(drawn_run, tmp_path):
         config_for_policy(export)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list_packaged_policies())
 def test_packaged_policies_act_in_the_world_of_their_name(name):
     world, _, method = name.partition("-")

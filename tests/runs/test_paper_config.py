@@ -125,6 +125,7 @@ def test_prior_is_one_for_all_rooms_from_ones_and_every_view_of_the_walks():
     assert world.bank.rows[:, 4 * NUM_CATEGORIES + 31 :].max() > 1  # several instances are in sight
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("prior_kind", ["of the run", "ones"])
 def test_belief_gap_and_weights_follow_equations_3_to_7(prior_kind):
     """A random sequence of views in float64; after few sightings (`ones`) the gaps are large."""
@@ -161,6 +162,7 @@ def test_belief_gap_and_weights_follow_equations_3_to_7(prior_kind):
     assert max(gaps) > (0.3 if prior_kind == "ones" else 1e-4)
 
 
+@pytest.mark.slow
 def test_weights_multiply_the_rows_of_experience_unscaled():
     """Equation 7: the experience of the policy is that of its method with raw weights."""
     world = paper_world()

@@ -35,6 +35,7 @@ def test_stream_config_disables_counterfactual_training(streams):
     assert (fused.decision, fused.direct, fused.counterfactual) == ("fused", "goal", "distil")
 
 
+@pytest.mark.slow
 def test_exported_stream_policy_acts(drawn_run, streams, tmp_path):
     drawn = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES_DIR / "layout-0")
     params = random_params(0, streams.policy_spec(len(streams.task.categories)))

@@ -130,6 +130,7 @@ def select_rows(rows, **fields):
     return [row for row in rows if fields.items() <= row.items()]
 
 
+@pytest.mark.slow
 def test_no_removal_has_a_row_unless_a_threshold_is_1(drawn_run, swept, evaluated):
     full = swept["argmax"]
     layout = evaluated.rows.index(EvaluationRow("layout", None, None, "argmax"))

@@ -55,6 +55,7 @@ def test_generated_rooms_and_houses_have_their_own_floor_plans(world):
     assert [floor_plan_name(scene_name) for scene_name in scene_names] == scene_names
 
 
+@pytest.mark.slow
 def test_generated_apartments_of_one_floor_plan_share_walls():
     scenes = [make_generated_scenes("apartments", "val", 10)[i] for i in range(10)]
     wall_masks = collections.defaultdict(set)

@@ -21,7 +21,7 @@ from jaxnav.scenes.worlds import WORLDS, load_scenes, make_generated_scenes, shi
 
 NUM_SCENES = {"apartments": 48, "houses": 48, "rooms": 96}  # a room has fewer pairs
 
-EVERY_WORLD = params_by_tier(["rooms", "apartments", "houses"], fast=["rooms"], slow=["houses"])
+EVERY_WORLD = params_by_tier(["rooms", "apartments", "houses"], fast=["rooms"])
 
 
 @functools.cache
@@ -146,6 +146,7 @@ def test_layout_shift_keeps_detection_ranges_of_categories(world):
             assert np.mean(ranges_after[type_name]) == pytest.approx(np.mean(ranges), abs=0.15), type_name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", EVERY_WORLD)
 def test_layout_shift_keeps_number_and_distance_of_goals(world):
     task = WORLDS[world].task

@@ -145,8 +145,11 @@ def distil_loss(decisions):
     return (jnp.exp(target) * (target - jax.nn.log_softmax(counterfactual.logits))).sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["own", "factual"])
-@pytest.mark.parametrize("method_name", ["org", pytest.param("support.methods:ATTENTIVE", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "method_name", ["org", pytest.param("support.methods:ATTENTIVE", marks=pytest.mark.exhaustive)]
+)
 def test_both_kinds_of_replay_agree_in_decisions_and_gradients(method_name, kind):
     agent_loop, weights, rollouts, _ = collect_two_rollouts(method_name, kind)
     rollout = rollouts[1]

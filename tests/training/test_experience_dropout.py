@@ -59,6 +59,7 @@ def collect_rollouts(method_name):
     return weights, rollouts
 
 
+@pytest.mark.slow
 def test_dropout_draws_whole_episodes():
     _, rollouts = collect_rollouts("org")
     flags = np.concatenate([rollout.transitions.use_experience for rollout in rollouts])
@@ -99,6 +100,7 @@ def test_replay_recomputes_log_probs_and_values(method_name):
         assert np.abs(other_log_probs - transitions.log_prob).max() > 0.01
 
 
+@pytest.mark.slow
 def test_without_experience_the_network_decides_under_do_z_equals_0():
     agent_loop = make_loop("org")
     weights = tiny.random_params(3, make_spec("org"))

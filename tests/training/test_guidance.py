@@ -41,6 +41,7 @@ def loss_terms(config, env_params):
     return jax.tree.map(np.asarray, jax.jit(compute)(run.weights))
 
 
+@pytest.mark.slow
 def test_guidance_adds_the_weighted_cross_entropy_to_shortest_paths():
     loss, terms, logits = loss_terms(guided_ppo(guidance=0.3), GUIDED_PARAMS)
     plain_loss, plain_terms, _ = loss_terms(CONFIG, PARAMS)
@@ -60,7 +61,9 @@ def test_guidance_adds_the_weighted_cross_entropy_to_shortest_paths():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("final_guidance", "expected"), [(None, 0.8), (0.0, 0.6)])
+@pytest.mark.parametrize(
+    ("final_guidance", "expected"), [pytest.param(None, 0.8, marks=pytest.mark.exhaustive), (0.0, 0.6)]
+)
 def test_guidance_goes_to_its_final_weight_within_a_stage(final_guidance, expected):
     """Update 1 of 4: a quarter of the way from 0.8 to 0 is 0.6; without a final weight it stays 0.8."""
     config = guided_ppo(guidance=0.8, final_guidance=final_guidance, learning_rate=0.0, epochs=1, minibatches=1)

@@ -271,6 +271,7 @@ def test_distillation_gradient_reaches_only_the_counterfactual_branch():
     assert {"view", "detections", "sought", "critic"} == NEW_WEIGHTS.keys() - reached_parts
 
 
+@pytest.mark.slow
 def test_distillation_gradient_is_that_of_kl_to_a_fixed_target_with_fixed_memories():
     """Neither the factual logits nor the memories have a part in the gradient."""
     run = rolled(True)

@@ -96,7 +96,8 @@ def test_nothing_is_learned_where_layouts_are_alike():
     assert np.abs(odds).max() < 1e-3
 
 
-@pytest.mark.parametrize("pooled", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("pooled", [False, pytest.param(True, marks=pytest.mark.exhaustive)])
 def test_signs_of_a_world(pooled):
     """Rooms of two categories: their exchange leaves the pair, so that there is nothing to learn but chances."""
     env, params = tiny.world()
@@ -109,6 +110,7 @@ def test_signs_of_a_world(pooled):
     np.testing.assert_array_equal(signs.co_visibility, co_visibility_from_counts(counts))
 
 
+@pytest.mark.slow
 def test_near_log_odds_of_a_world():
     """Rooms of two categories: their exchange leaves the pair as near as before, so it tells nothing."""
     env, params = tiny.world()

@@ -97,9 +97,8 @@ def test_experience_coin_is_constant_within_an_episode():
         np.testing.assert_array_equal(next_rollout.initial_memory.use_experience[running], last_coins[running])
 
 
-@pytest.mark.parametrize(
-    "experience_prob", [pytest.param(0.25, marks=pytest.mark.slow), pytest.param(0.8, marks=pytest.mark.exhaustive)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("experience_prob", [0.25, pytest.param(0.8, marks=pytest.mark.exhaustive)])
 def test_experience_coin_has_the_configured_probability(experience_prob):
     learner = make_learner("org", experience=experience_prob)
     learner = dataclasses.replace(learner, config=dataclasses.replace(learner.config, num_envs=1024))
@@ -230,6 +229,7 @@ def test_fused_training_has_one_learning_rate_schedule():
 # Replay and gradients
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method_name", HOST_PARAMS)
 def test_replay_of_streams_recomputes_log_probs_and_values(method_name):
     weights, rollouts = collect_rollouts(method_name)

@@ -243,6 +243,7 @@ def test_tables_equal_the_twin_at_every_pose(source, stride, world):
         assert count_table_differences(scene, guide, task) == collections.Counter()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", ["apartments", "houses"])
 def test_tables_of_a_generated_home_equal_the_twin(world):
     task = dataclasses.replace(WORLDS[world].task, detector=PERFECT_DETECTOR)

@@ -204,6 +204,7 @@ def test_every_decision_is_the_twins(method, decision, count):
     assert removals > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "weight_kind"),
     params_by_tier([(name, "relative") for name in ("org", "eotp", "semexp", "vtnet")], fast=[("org", "relative")]),
@@ -233,7 +234,8 @@ def weights_of_sum_one(method: str) -> type[TwinMethod]:
     return Raw
 
 
-@pytest.mark.parametrize("strength", [5.0, pytest.param(None, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("strength", [5.0, pytest.param(None, marks=pytest.mark.exhaustive)])
 def test_decisions_of_the_setting_paper_are_the_twins(strength):
     """Equations 1 to 7 with instance counts, from a weak prior with large gaps and from the counts themselves."""
     setting = dataclasses.replace(ESTIMATORS["paper"], strength=strength)

@@ -99,6 +99,7 @@ def corridor_walk():
     return episode, search_states
 
 
+@pytest.mark.slow
 def test_snapshot_holds_the_search_state_of_the_agent(corridor_walk):
     episode, search_states = corridor_walk
     snapshot = take_snapshot(episode, NUM_STEPS - 1)
@@ -106,6 +107,7 @@ def test_snapshot_holds_the_search_state_of_the_agent(corridor_walk):
         np.testing.assert_array_equal(snapshot_leaf, agent_leaf)
 
 
+@pytest.mark.slow
 def test_snapshot_predicts_the_walk_while_nothing_new_is_seen(corridor_walk):
     """The floor to the north is open, as the plan assumes: a cell a step, except for the first, which looks down."""
     episode, search_states = corridor_walk
@@ -149,6 +151,7 @@ def count_pixels(path):
     return num_pixels
 
 
+@pytest.mark.slow
 def test_draw_search_shows_the_goal_or_else_the_chosen_block(corridor_walk, tmp_path):
     """The goal is in the first view; a block is shown only while the goal's category was never seen."""
     episode, _ = corridor_walk
@@ -193,6 +196,7 @@ def test_snapshot_refuses_a_method_without_a_map(corridor_walk):
 # Belief
 
 
+@pytest.mark.slow
 def test_heat_maps_show_the_belief_before_and_after_removal(corridor_walk, tmp_path):
     """With a removal weight of 1 the belief is that by places, softmax(0) without a fit; a chair attracts the book."""
     episode, _ = corridor_walk

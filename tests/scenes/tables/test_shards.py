@@ -178,6 +178,7 @@ def test_compile_shards_builds_only_missing_shards(tmp_path):
 # Kills, errors and damage
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("signal_number", [signal.SIGKILL, signal.SIGINT])
 def test_killed_build_leaves_whole_shards_and_no_process(tmp_path, signal_number):
     gated_corridors = GatedCorridors(gate_path=str(tmp_path / "gate"), gated=(4, 5, 6))

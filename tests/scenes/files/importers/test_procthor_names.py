@@ -134,6 +134,7 @@ def types_and_guesses(house_file: Path, asset_file: Path | None) -> tuple[list[t
     return types, num_guesses
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("house_set", "num_houses", "num_guessed"), [("100k", 30, 2821), ("ai2", 20, 1431), ("objaverse", 100, 0)]
 )
