@@ -20,7 +20,15 @@ from jaxnav.experiments.gap_traces import Belief
 from jaxnav.experiments.similarity import GainBySimilarity, SuccessBySimilarity, gain_of_table, success_of_table
 from jaxnav.experiments.table import Curve, ResultTable
 from jaxnav.experiments.trials import PAPER_THRESHOLD, SWEPT_FORMS, ZERO_THRESHOLD, Trial
-from jaxnav.viz.style import MUTED_COLOR, TEXT_COLOR, default_style, freeze_axes_positions, make_panels, set_panel_title
+from jaxnav.viz.style import (
+    MUTED_COLOR,
+    TEXT_COLOR,
+    default_style,
+    freeze_axes_positions,
+    make_panels,
+    repeat_styles,
+    set_panel_title,
+)
 
 _LINE = {"lw": 1.5, "ms": 4.5}
 #: Styles of lines; neighbours differ in lightness.
@@ -31,6 +39,7 @@ LINE_STYLES: tuple[dict[str, Any], ...] = (
     {"color": "#0072B2", "marker": "D", "ls": "--"} | _LINE,
     {"color": "#CC79A7", "marker": "v", "ls": (0, (6, 1.5))} | _LINE,
     {"color": "#8a8a8a", "marker": "P", "ls": (0, (3, 1, 1, 1, 1, 1))} | _LINE,
+    {"color": "#009E73", "marker": "X", "ls": ":"} | _LINE,
 )
 REFERENCE_STYLE = {"color": MUTED_COLOR, "lw": 1, "ls": ":"}
 SEED_STYLE = {"lw": 0.6, "alpha": 0.6}
@@ -207,8 +216,9 @@ def epsilon_figure(sweeps: Mapping[tuple[float, Form], Mapping[float, Mapping[st
     shifts = sorted({shift for shift, _ in sweeps})
     figure, panels = make_panels(len(forms), len(_METRIC_LABELS), height=2.3 * len(forms) + 0.4, sharey="col")
 
+    style_by_shift = dict(zip(shifts, repeat_styles(LINE_STYLES, len(shifts)), strict=True))
     for (shift, form), metrics_by_epsilon in sweeps.items():
-        style = LINE_STYLES[shifts.index(shift)]
+        style = style_by_shift[shift]
         epsilons = list(metrics_by_epsilon)
         for axes, metric in zip(panels[forms.index(form)], _METRIC_LABELS, strict=True):
             intervals = [metrics[metric] for metrics in metrics_by_epsilon.values()]
@@ -220,7 +230,7 @@ def epsilon_figure(sweeps: Mapping[tuple[float, Form], Mapping[float, Mapping[st
             axes.set(ylabel=label, xlabel="Threshold ε")
         set_panel_title(row_axes[0], f"{form.capitalize()} form")
 
-    keys = [legend_key(f"shift {shift:g}", style) for shift, style in zip(shifts, LINE_STYLES, strict=False)]
+    keys = [legend_key(f"shift {shift:g}", style) for shift, style in style_by_shift.items()]
     add_legend(figure, [*keys, legend_key("one training seed", {"color": MUTED_COLOR, **SEED_STYLE})])
     return freeze_axes_positions(figure)
 
@@ -238,7 +248,7 @@ def gap_figure(panels_by_setting: Mapping[str, GapLines]) -> Figure:
     # A colour and marker per shift, a dash per belief.
     shifts = sorted({shift for lines in panels_by_setting.values() for shift, _ in lines})
     styles = {}
-    for shift, shift_style in zip(shifts, LINE_STYLES, strict=False):
+    for shift, shift_style in zip(shifts, repeat_styles(LINE_STYLES, len(shifts)), strict=True):
         for belief, belief_style in _BELIEF_STYLES.items():
             styles[shift, belief] = shift_style | belief_style
 
@@ -268,7 +278,8 @@ def auc_figure(curve_by_setting: Mapping[str, Curve]) -> Figure:
     axes.set(xlabel="Step", ylabel="AUC of the gap, shifted against unshifted")
 
     keys = []
-    for (setting, curve), style in zip(curve_by_setting.items(), LINE_STYLES, strict=False):
+    styles = repeat_styles(LINE_STYLES, len(curve_by_setting))
+    for (setting, curve), style in zip(curve_by_setting.items(), styles, strict=True):
         draw_band(axes, curve, style)
         keys.append(legend_key(setting, style))
     add_legend(figure, [*keys, legend_key("chance", REFERENCE_STYLE)])

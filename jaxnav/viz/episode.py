@@ -388,17 +388,18 @@ def draw_frames(episodes: Sequence[PlayedEpisode], *, last_only: bool = False) -
     figure.text(margin, top, f"Looking for {goal_name}", color=GOAL_COLOR, fontsize=14, weight="bold")
     figure.text(1 - margin, bottom, first_episode.title, color=MUTED_COLOR, fontsize=8, ha="right")
 
-    # One frame for each step, or the last one alone.
-    last_step = max_steps - 1
-    step_stride = -(-max_steps // MAX_FRAMES)
-    frame_steps = [last_step] if last_only else [*range(0, last_step, step_stride), last_step]
     frames = []
-    for step in frame_steps:
+    for step in [max_steps - 1] if last_only else select_frame_steps(max_steps):
         for panel in panels:
             panel.draw_step(step)
         canvas.draw()
         frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
     return frames
+
+
+def select_frame_steps(num_steps: int) -> list[int]:
+    """Select the steps that an animation shows: all, or `MAX_FRAMES` evenly spaced ones with the first and the last."""
+    return np.linspace(0, num_steps - 1, min(num_steps, MAX_FRAMES)).round().astype(int).tolist()
 
 
 def encode_gif(frames: Sequence[Image.Image], step_milliseconds: int) -> bytes:

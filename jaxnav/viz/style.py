@@ -1,6 +1,7 @@
 """Look of all figures: colors, axes without clutter, and files whose bytes depend on the figure alone."""
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,13 @@ def style_axes(axes: Axes, label_size: float) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(MUTED_COLOR)
     axes.tick_params(labelcolor=TEXT_COLOR, labelsize=label_size, color=MUTED_COLOR)
+
+
+def repeat_styles(styles: Sequence[dict[str, Any]], count: int) -> list[dict[str, Any]]:
+    """Return styles of `count` lines; when all styles are used, they repeat with white markers."""
+    return [
+        styles[index % len(styles)] | ({"mfc": "white"} if index // len(styles) % 2 else {}) for index in range(count)
+    ]
 
 
 def set_panel_title(axes: Axes, *lines: str) -> None:

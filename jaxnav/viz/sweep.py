@@ -11,8 +11,17 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from jaxnav.evaluation.statistics import Interval
+from jaxnav.policies.methods import method_label
 from jaxnav.runs.evaluate import Sweep
-from jaxnav.viz.style import MUTED_COLOR, TEXT_COLOR, default_style, freeze_axes_positions, make_panels, set_panel_title
+from jaxnav.viz.style import (
+    MUTED_COLOR,
+    TEXT_COLOR,
+    default_style,
+    freeze_axes_positions,
+    make_panels,
+    repeat_styles,
+    set_panel_title,
+)
 
 # Styles of the layout shifts; neighbours differ in lightness, marker and dash.
 _SHIFT_STYLES: tuple[dict[str, Any], ...] = (
@@ -40,7 +49,7 @@ def sweep_figure(sweeps: Sweep | Sequence[Sweep], title: str | None = None) -> F
     figure, panels = make_panels(2, 2, height=5.2, sharex=True)
 
     max_percent = 0.0
-    for sweep, style in zip(sweeps, _repeat_styles(len(sweeps)), strict=True):
+    for sweep, style in zip(sweeps, repeat_styles(_SHIFT_STYLES, len(sweeps)), strict=True):
         # Rows in rising order of their thresholds; no removal is no point of the curve.
         row_by_threshold = {row.epsilon: row for row in sweep.rows() if row.epsilon is not None}
         thresholds = sorted(row_by_threshold)
@@ -82,23 +91,18 @@ def _upper_bound(interval: Interval) -> float:
     return max(interval.mean, *interval.seeds, interval.high if interval.has_bounds else 0.0)
 
 
-def _repeat_styles(count: int) -> list[dict[str, Any]]:
-    """Styles of a number of curves; more than five repeat."""
-    return [_SHIFT_STYLES[index % len(_SHIFT_STYLES)] for index in range(count)]
-
-
 def _describe_evaluation(sweep: Sweep) -> str:
     """Method, source and episodes, for a title."""
     settings = sweep.settings
     decoding = {"argmax": "best actions", "sample": "sampled actions"}[settings["decoding"]]
     source_name = Path(settings["source"]).name
     episodes = f"{settings['episodes']:,} {settings['split']} episodes"
-    return f"{settings['method'].upper()}, {source_name}: {episodes}, {decoding}"
+    return f"{method_label(settings['method'])}, {source_name}: {episodes}, {decoding}"
 
 
 def _add_legend(figure: Figure, sweeps: Sequence[Sweep]) -> None:
     handles: list[Artist] = []
-    for sweep, style in zip(sweeps, _repeat_styles(len(sweeps)), strict=True):
+    for sweep, style in zip(sweeps, repeat_styles(_SHIFT_STYLES, len(sweeps)), strict=True):
         handles.append(Line2D([], [], label=f"shift {sweep.settings['shift']:g}", lw=1.4, ms=4, **style))
     if sweeps[0].sr.shape[1] > 1:
         handles.append(Line2D([], [], label="one training seed", color=MUTED_COLOR, lw=0.6))

@@ -20,7 +20,7 @@ from jaxnav.evaluation.removal import InferenceTrace
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.tables.visibility import cell_centres
 from jaxnav.scenes.task import DONE, NUM_ACTIONS, Rules
-from jaxnav.viz.episode import EpisodePanel, PlayedEpisode, draw_episode
+from jaxnav.viz.episode import EpisodePanel, PlayedEpisode, draw_episode, select_frame_steps
 
 
 def make_episode(action, success=False, shift=0.0, variant: PlayedVariant = "stde"):
@@ -48,6 +48,14 @@ def make_episode(action, success=False, shift=0.0, variant: PlayedVariant = "std
         variant=variant,
         policies=tiny.make_untrained_policies(),
     )
+
+
+@pytest.mark.parametrize("num_steps", [1, 2, 60, 61, 120, 300])
+def test_animation_shows_at_most_sixty_steps_from_the_first_to_the_last(num_steps):
+    steps = select_frame_steps(num_steps)
+    assert len(steps) == min(num_steps, 60)
+    assert (steps[0], steps[-1]) == (0, num_steps - 1)
+    assert len(set(np.diff(steps))) <= 2  # evenly spaced, rounded
 
 
 @pytest.mark.slow

@@ -186,6 +186,20 @@ def test_the_auc_figure_has_a_line_by_estimator():
     assert legend_texts(figure)[:2] == ["calibrated", "evidence"]
 
 
+def test_more_lines_than_styles_can_be_told_apart():
+    curve_by_estimator = {f"estimator {index}": make_curve(0.5, 0.6, 0.7) for index in range(9)}
+    (axes,) = figures.auc_figure(curve_by_estimator).axes
+    lines = [line for line in axes.get_lines() if line.get_marker() != "None"]
+    looks = {(line.get_color(), line.get_marker(), line.get_markerfacecolor()) for line in lines}
+    assert len(lines) == len(looks) == 9
+
+    # Every shift has a line in the sweep, too.
+    sweeps: dict[tuple[float, Form], dict[float, dict[str, Interval]]] = {}
+    for index in range(9):
+        sweeps[index / 8, "paper"] = {0.0: make_metrics(60.0, 30.0, 1.5), 1.0: make_metrics(61.0, 31.0, 1.5)}
+    assert len(set(legend_texts(figures.epsilon_figure(sweeps)))) == 9 + 1  # and the training seeds
+
+
 def test_the_effects_figure_fills_markers_whose_interval_excludes_zero():
     first, second = DRAWINGS["effects"]().axes
     np.testing.assert_allclose(np.concatenate(marked_lines(first)), [[3, 0], [-1, 1]])
