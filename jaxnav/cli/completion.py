@@ -104,6 +104,8 @@ def _share_experiment_options(script: str) -> str:
     name = next(iter(EXPERIMENTS))
     _, _, after_name = script.partition(f"'{name}': {{'description': '{name}', 'options': ")
     options, _, _ = after_name.partition(", 'subcommands': {}")
+    if not options:
+        return script  # of another version of tyro: complete, but long
     shared = script.replace(options, "EXPERIMENT_OPTIONS")
     return shared.replace("COMPLETION_SPEC = ", f"EXPERIMENT_OPTIONS = {options}\nCOMPLETION_SPEC = ", 1)
 

@@ -2,8 +2,7 @@
 
 from rich.console import Console
 
-from jaxnav.cli.console import parse_arguments, refuse_unwritable, run_command
-from jaxnav.errors import InputError
+from jaxnav.cli.console import parse_arguments, refuse_folder, refuse_unwritable, run_command
 from jaxnav.report.config import ReportConfig
 
 DESCRIPTION = "Show a training run on one HTML page: tables, curves and replays of episodes."
@@ -25,8 +24,7 @@ def _write_report(config: ReportConfig, console: Console) -> None:
 
     # Check the options before anything is measured.
     target = config.out or config.run / "report.html"
-    if target.is_dir():
-        raise InputError(f"--out {target}: is a folder; give the name of a file to write")
+    refuse_folder(target, "--out")
 
     run = Run.open(config.run)
     reference_run = None if config.reference is None else Run.open(config.reference)

@@ -65,13 +65,14 @@ def _draw_learning_curves(run: "Run", console: Console) -> None:
         return
 
     # Import only now: the plotting packages are optional.
+    from jaxnav.policies.methods import method_label
     from jaxnav.viz.learning import learning_figure
     from jaxnav.viz.style import save_figure
 
     config = run.config
     scenes_name = Path(config.scene_source).name
     plural = "s" if config.seeds > 1 else ""
-    title = f"{config.method.upper()} in {scenes_name}, {config.seeds} seed{plural}"
+    title = f"{method_label(config.method)} in {scenes_name}, {config.seeds} seed{plural}"
     path = config.run_dir / LEARNING_CURVES_FILE
     save_figure(learning_figure(run.log(), run.success_by_budget(), title), path)
     console.print(f"learning curves: {path}")

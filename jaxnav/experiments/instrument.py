@@ -72,8 +72,10 @@ class SceneTotals(NamedTuple):
     """Measures of N scenes at one shift.
 
     Attributes:
-      values: float64 [S, N], sums over the episodes of each scene by seed; S = 1 for measures without training.
-      weights: float64 [N], number of episodes of each scene; a mean is the sum of values / the sum of weights.
+      values: float64 [S, N], sums over the episodes of each scene by seed, or, for `LAYOUT_MEASURES`, one value of each
+        scene; S = 1 for measures without training.
+      weights: float64 [N], number of episodes of each scene, or 1 for `LAYOUT_MEASURES`; 0 for scenes that the measure
+        leaves out. A mean is the sum of values / the sum of weights.
       categories: float64 [N, K], means by goal category; NaN for categories that do not occur.
       rooms: [N], room types.
       names: [N], names of the scenes.
@@ -124,6 +126,11 @@ def measure_scenes(
     # Exact means count as often as a scene has episodes, so that all measures are sums over episodes.
     episode_counts = np.bincount(episodes.scene, minlength=num_scenes).astype(np.float64)
     baseline_argmax, baseline_sample = 100.0 * np.asarray(outcome.success, np.float64)
+
+    # Done can only be judged where a goal is detected; a scene without any such goal does not count.
+    num_judged_goals = (~np.isnan(scenes.succeeds)).sum(axis=1)
+    done_succeeds = np.nansum(scenes.succeeds, axis=1) / np.maximum(num_judged_goals, 1)
+    judged_counts = episode_counts * (num_judged_goals > 0)
     values: dict[str, np.ndarray] = {
         "best_length": episode_counts * scenes.best_length[None],
         "random_sr": episode_counts * 100.0 * scenes.random_success[None],
@@ -131,7 +138,7 @@ def measure_scenes(
         "frontier_steps": sum_by_scene(scenes.actions[None].astype(np.float64)),
         "start_distance": episode_counts * np.nanmean(scenes.distance, axis=1)[None],
         "goal_detected": episode_counts * 100.0 * np.nanmean(scenes.detected, axis=1)[None],
-        "done_succeeds": episode_counts * 100.0 * np.nanmean(scenes.succeeds, axis=1)[None],
+        "done_succeeds": judged_counts * 100.0 * done_succeeds[None],
         "layout_gap": np.nan_to_num(scenes.gap)[None],
         "layout_similarity": np.nan_to_num(scenes.similarity)[None],
         "baseline_argmax_sr": sum_by_scene(baseline_argmax),
@@ -151,9 +158,8 @@ def measure_scenes(
 
     # Weights of the scenes in the mean of every measure.
     has_cooccurrence = (~np.isnan(scenes.gap)).astype(np.float64)
-    weights: dict[str, np.ndarray] = {}
-    for measure in values:
-        weights[measure] = has_cooccurrence if measure in LAYOUT_MEASURES else episode_counts
+    weights = dict.fromkeys(values, episode_counts) | {"done_succeeds": judged_counts}
+    weights |= dict.fromkeys(LAYOUT_MEASURES, has_cooccurrence)
 
     # Room types in the order of the scenes, bank by bank.
     room_types: list[str] = []

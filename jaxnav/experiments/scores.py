@@ -334,6 +334,8 @@ def measure_groups(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
         # The effect varies with the networks of both sides, unless they are the same or the reference has none. A group
         # uses the first S runs of each agent, S being the fewest runs of an agent.
         compared = [member[variant] for member in members]
+        for other in (*compared[1:], *references):
+            check_same_episodes(compared[0].episodes, other.episodes)
         clusters = compared[0].episodes.clusters()
         is_untrained = agent_variant in UNTRAINED_VARIANTS
         same_networks = not agent and "baseline" not in (variant, reference)

@@ -294,10 +294,14 @@ def has_part(path: Path, settings: Mapping[str, Any]) -> bool:
 
 
 def read_settings(path: Path) -> dict[str, Any] | None:
-    """Read the settings of a file; None if it is missing or damaged."""
+    """Read the settings of a file; None if it is missing or damaged.
+
+    Raises:
+      InputError: the file holds results of another format, which must not be lost.
+    """
     try:
         part_settings, _ = _read_file(path)
-    except (FileNotFoundError, InputError):
+    except (FileNotFoundError, _DamagedFileError):
         return None
     return part_settings
 
@@ -319,6 +323,10 @@ def read_part(path: Path, settings: Mapping[str, Any] | None = None) -> list[Res
     return rows
 
 
+class _DamagedFileError(InputError):
+    """A file of results cannot be read."""
+
+
 def _read_file(path: Path) -> tuple[dict[str, Any], list[ResultRow]]:
     """Read the settings and the rows of a file."""
     try:
@@ -327,5 +335,5 @@ def _read_file(path: Path) -> tuple[dict[str, Any], list[ResultRow]]:
             rows = [ResultRow.from_json(head["shared"] | line) for line in row_lines]
             return dict(head["settings"]), rows
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: is damaged ({error}); delete it, and it is measured again") from error
-    raise InputError(f"{path}: holds no results of format {RESULTS_FORMAT}; measure them again")
+        raise _DamagedFileError(f"{path}: is damaged ({error}); delete it, and it is measured again") from error
+    raise InputError(f"{path}: holds no results of format {RESULTS_FORMAT}; move it away to measure them again")

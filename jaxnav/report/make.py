@@ -265,17 +265,17 @@ def _thresholds_section(reports: Mapping[float, _Report]) -> Section | None:
 
 def _gap_section(run: Run, by_shift: Mapping[float, ShiftMeasurements]) -> Section | None:
     # Streamed scenes and agents without the layout have no gap, at any shift.
-    traces_by_shift = []
-    for measurements in by_shift.values():
+    traces_by_shift = {}
+    for shift, measurements in by_shift.items():
         if measurements.gaps is not None:
-            traces_by_shift.append(measurements.gaps)
+            traces_by_shift[shift] = measurements.gaps
     if not traces_by_shift:
         return None
-    traces_by_shift = truncate_to_shortest(traces_by_shift)
+    traces = truncate_to_shortest(list(traces_by_shift.values()))
 
     # A curve for each shift and each way of updating the belief.
     curve_by_line = {}
-    for shift, gap_traces in zip(by_shift, traces_by_shift, strict=True):
+    for shift, gap_traces in zip(traces_by_shift, traces, strict=True):
         gap_bounds = mean_by_step(gap_traces)[:, 0]  # mean and bounds of the run's own estimator
         steps = np.arange(gap_bounds.shape[-1], dtype=np.float64)
         for belief, belief_index in BELIEFS.items():

@@ -412,13 +412,13 @@ class _TensorStoreHook:
 
 @contextlib.contextmanager
 def _report_unsaved(folder: Path) -> Iterator[None]:
-    """Turn the errors of Orbax and TensorStore about a full disk, which are of many kinds, into an `InputError`."""
+    """Turn the errors of Orbax and TensorStore while they save, which are of many kinds, into an `InputError`."""
     try:
         yield
     except InputError:
         raise
     except Exception as error:
-        advice = "free space and inodes on the disk, then run the same command again"
+        advice = "if the disk is full, free space and inodes; then run the same command again"
         raise InputError(f"{folder}: cannot be saved ({_summarize_root(error)}); {advice}") from error
     finally:
         gc.collect()  # asyncio logs the error of a task when it is collected

@@ -57,7 +57,8 @@ def test_report_refuses_folders_without_a_finished_run(run_dir, tmp_path, capsys
         ((foreign,), f"{foreign}/config.json"),
         ((run_dir, "--reference", empty), f"{empty}: holds no run"),
         ((run_dir, "--reference", unfinished), f"{unfinished}/policies/baseline-0: is missing"),
-        ((run_dir, "--out", empty), f"--out {empty}: is a folder; give the name of a file to write"),
+        ((run_dir, "--out", empty), f"--out {empty}: is a folder"),
+        ((run_dir, "--out", run_dir / "config.json" / "page.html"), "lies in a file; give the name of a file to write"),
         ((run_dir, "--replays", 1), "--replays 1: give at least 2, one for each shift"),
     ):
         assert report(*arguments) == 2

@@ -150,12 +150,7 @@ def truncate(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-9])
 
 
-def change_format(path: Path) -> None:
-    head, *lines = path.read_text().splitlines(keepends=True)
-    path.write_text("".join([json.dumps(json.loads(head) | {"format": 2}) + "\n", *lines]))
-
-
-@pytest.mark.parametrize("damage", [Path.unlink, truncate, change_format, lambda path: path.write_text("")])
+@pytest.mark.parametrize("damage", [Path.unlink, truncate, lambda path: path.write_text("")])
 def test_driver_measures_parts_again_that_are_missing_or_damaged(measured, tmp_path, damage):
     config = make_config(tmp_path)
     run_experiment(config, QUIET)
@@ -203,6 +198,20 @@ def test_driver_refuses_to_lose_results_of_other_settings(measured, tmp_path, ch
     # In another folder there is nothing to lose.
     run_experiment(make_config(tmp_path, results=tmp_path / "others", **changes), QUIET)
     assert measured == ALL_CALLS
+
+
+def test_driver_refuses_to_lose_results_of_another_format(measured, tmp_path):
+    run_experiment(make_config(tmp_path), QUIET)
+    path = results_of(tmp_path) / "near-a-shifts-0.jsonl"
+    head, *lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join([json.dumps(json.loads(head) | {"format": 2}) + "\n", *lines]))
+    before = contents(tmp_path)
+    measured.clear()
+
+    with pytest.raises(InputError, match=r"near-a-shifts-0\.jsonl: holds no results of format \d+; move it away"):
+        run_experiment(make_config(tmp_path), QUIET)
+    assert measured == []
+    assert contents(tmp_path) == before
 
 
 def test_driver_goes_on_where_it_was_stopped(measured, tmp_path, monkeypatch):

@@ -13,6 +13,7 @@ from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import join_episode_lists
 from jaxnav.evaluation.grid import EpisodeOutcome
 from jaxnav.evaluation.statistics import Interval
+from jaxnav.experiments import instrument
 from jaxnav.experiments.config import ExperimentConfig
 from jaxnav.experiments.instrument import (
     BASELINE_MEASURES,
@@ -35,15 +36,17 @@ from jaxnav.scenes.task import Rules, Task
 # Measures of one shift
 
 
-def test_agents_that_always_succeed_have_a_success_of_100_percent(drawn_run, monkeypatch):
-    def succeed(rows, policies, world, num_episodes, seed):
-        episode_lists = draw_episode_lists(world, num_episodes, seed)
-        shape = (len(rows), policies.num_seeds, len(join_episode_lists(episode_lists).goal))
-        outcome = EpisodeOutcome.zeros(shape)._replace(
-            done=np.ones(shape, bool), success=np.ones(shape, bool), length=np.ones(shape, int)
-        )
-        return episode_lists, outcome, 1
+def succeed(rows, policies, world, num_episodes, seed):
+    """Evaluate rows as if every episode succeeded."""
+    episode_lists = draw_episode_lists(world, num_episodes, seed)
+    shape = (len(rows), policies.num_seeds, len(join_episode_lists(episode_lists).goal))
+    outcome = EpisodeOutcome.zeros(shape)._replace(
+        done=np.ones(shape, bool), success=np.ones(shape, bool), length=np.ones(shape, int)
+    )
+    return episode_lists, outcome, 1
 
+
+def test_agents_that_always_succeed_have_a_success_of_100_percent(drawn_run, monkeypatch):
     monkeypatch.setattr("jaxnav.experiments.instrument.evaluate_rows", succeed)
     world = compile_evaluation_world(drawn_run.config, "val", None, 0.0, Console(quiet=True))
     policies = load_policies(drawn_run.config, ("baseline",))
@@ -53,6 +56,25 @@ def test_agents_that_always_succeed_have_a_success_of_100_percent(drawn_run, mon
     for measure in (*BASELINE_MEASURES, "layout_blind_argmax_sr", "layout_blind_sample_sr"):
         means = totals.values[measure].sum(axis=1) / totals.weights[measure].sum()
         np.testing.assert_allclose(means, 100.0)
+
+
+def test_scenes_whose_goals_are_never_detected_do_not_count(drawn_run, monkeypatch):
+    """Where no goal is detected, nobody can tell how often Done would succeed."""
+    monkeypatch.setattr("jaxnav.experiments.instrument.evaluate_rows", succeed)
+    whole_measure = instrument._measure_bank
+
+    def measure_bank(*arguments):
+        measures = whole_measure(*arguments)
+        succeeds = np.array(measures.succeeds)
+        succeeds[0] = np.nan
+        succeeds[1:] = np.where(np.isnan(succeeds[1:]), np.nan, 0.5)
+        return measures._replace(succeeds=succeeds)
+
+    monkeypatch.setattr(instrument, "_measure_bank", measure_bank)
+    world = compile_evaluation_world(drawn_run.config, "val", None, 0.0, Console(quiet=True))
+    totals = measure_scenes(world, load_policies(drawn_run.config, ("baseline",)), None, num_episodes=24, seed=0)
+    assert totals.weights["done_succeeds"][0] == 0 < totals.weights["goal_detected"][0]
+    assert totals.values["done_succeeds"].sum() / totals.weights["done_succeeds"].sum() == 50.0
 
 
 # Comparison of shifts

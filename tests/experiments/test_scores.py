@@ -247,6 +247,13 @@ def test_groups_without_agents_or_reference_have_no_rows(measured_groups):
     assert table.rows == ()
 
 
+def test_groups_of_agents_in_other_episodes_are_refused(measured_groups, monkeypatch):
+    elsewhere = make_scores({"layout": [[0, 1, 0]], "stde": [[0, 1, 0]]}, episodes_in([0, 1, 2], goal=[1] * 3))
+    monkeypatch.setitem(SCORES_BY_AGENT, "b", elsewhere)
+    with pytest.raises(InputError, match="train both"):
+        measured_groups(gain={"agents": ["a", "b"], "variant": "stde", "against": "layout"})
+
+
 # Value and cost of experience
 
 

@@ -13,7 +13,16 @@ from hypothesis import strategies as st
 
 from jaxnav.errors import InputError
 from jaxnav.evaluation.statistics import Interval
-from jaxnav.experiments.table import KEY_FIELDS, Curve, ResultRow, ResultTable, has_part, read_part, write_part
+from jaxnav.experiments.table import (
+    KEY_FIELDS,
+    Curve,
+    ResultRow,
+    ResultTable,
+    has_part,
+    read_part,
+    read_settings,
+    write_part,
+)
 
 SETTINGS = {"split": "val", "shifts": [0.0, 1.0], "run": {"method": "org", "seeds": 3}}
 
@@ -199,7 +208,6 @@ GOOD_HEAD = '{"settings": {}, "versions": {}, "format": 4, "shared": {"world": "
         *(GOOD_HEAD.encode() + line for line in (b'{"metric": "sr", "mean": "x"}', b'{"metric": "sr", "mean": [1]}')),
         GOOD_HEAD.encode() + b'{"metric": "gap", "positions": [0, 1], "mean": ["x", "y"]}',
         GOOD_HEAD.encode() + b'{"metric": "gap", "positions": 0, "mean": 1}',
-        GOOD_HEAD.replace(": 4", ": 3").encode(),
     ],
 )
 def test_a_damaged_file_is_refused_by_its_name(tmp_path, content):
@@ -208,6 +216,15 @@ def test_a_damaged_file_is_refused_by_its_name(tmp_path, content):
     with pytest.raises(InputError, match=r"part\.jsonl"):
         read_part(path)
     assert not has_part(path, {})
+
+
+def test_a_file_of_another_format_is_neither_read_nor_called_damaged(tmp_path):
+    """Only damaged files may be measured again, and replaced."""
+    path = tmp_path / "part.jsonl"
+    path.write_text(GOOD_HEAD.replace(": 4", ": 3"))
+    for read in (read_part, read_settings):
+        with pytest.raises(InputError, match=r"part\.jsonl: holds no results of format 4; move it away"):
+            read(path)
 
 
 # The table

@@ -239,7 +239,7 @@ def test_full_disk_is_one_line_and_loses_nothing(tmp_path, monkeypatch, error):
 
     with monkeypatch.context() as patches:
         patches.setattr(checkpoint.ocp.training.Checkpointer, "save", fail)
-        with pytest.raises(InputError, match=r"checkpoints/2: cannot be saved \(.*; free space and inodes") as refusal:
+        with pytest.raises(InputError, match=r"checkpoints/2: cannot be saved \(.*; if the disk is full") as refusal:
             checkpoint.save_checkpoint(tmp_path, 2, make_state(2), MANIFEST)
     assert "\n" not in str(refusal.value)
 
