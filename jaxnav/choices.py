@@ -11,6 +11,8 @@ Form = Literal["paper", "residual", "switch", "mixture"]
 Reduction = Literal["mean_visible", "mean", "sum"]
 #: Counts of a view in eq. 3: 1 for each visible category, or the number of its visible instances.
 Counts = Literal["presence", "instances"]
+#: Measures of the layout gap, see `jaxnav.layout.EstimatorConfig`.
+GapName = Literal["novelty", "evidence", "learned", "surprise", "overdue", "clock"]
 #: Layout estimators that an evaluation may use in place of the one from training.
 EstimatorName = Literal["paper", "released", "evidence", "learned", "surprise", "overdue", "clock"]
 #: Ways to use policies in an evaluation, agents of other kinds, and the references without training.

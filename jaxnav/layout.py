@@ -29,7 +29,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxnav.choices import Counts, Reduction
+from jaxnav.choices import Counts, Form, GapName, Reduction
 from jaxnav.gaps import (
     CooccurrenceEvidence,
     PairSightings,
@@ -88,13 +88,13 @@ class EstimatorConfig:
     increment: int = 1
     own_column: bool = False
     gate: bool = True
-    gap: Literal["novelty", "evidence", "learned", "surprise", "overdue", "clock", "none"] = "novelty"
+    gap: Literal[GapName, "none"] = "novelty"
     hold: bool = False
     decay: float = 0.8
     passes: int = 1
     strength: float | None = 20.0
     uniform: float = 0.05
-    form: Literal["paper", "residual", "switch"] = "residual"
+    form: Form = "residual"
 
     def __post_init__(self):
         # Words must be among the options of the field.

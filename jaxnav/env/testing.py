@@ -36,19 +36,18 @@ def check_environment(
     max_traces = 2**31 if jax.config.values["jax_disable_jit"] else 1
     batched_reset = jax.jit(jax.vmap(chex.assert_max_traces(env.reset, n=max_traces), (0, None)))
     batched_step = jax.jit(jax.vmap(chex.assert_max_traces(env.step, n=max_traces), (0, 0, 0, None)))
-    key = jax.random.key(seed)
+    reset_key, action_key, step_key = jax.random.split(jax.random.key(seed), 3)
 
     # Resets are reproducible.
-    reset_keys = jax.random.split(key, num_envs)
+    reset_keys = jax.random.split(reset_key, num_envs)
     observation, state = batched_reset(reset_keys, params)
     chex.assert_trees_all_equal((observation, state), batched_reset(reset_keys, params))
     _check_observation(env, observation, num_envs)
 
     for step_index in range(num_steps):
         # Take random actions.
-        step_key = jax.random.fold_in(key, step_index)
-        step_keys = jax.random.split(step_key, num_envs)
-        action = jax.random.randint(jax.random.fold_in(step_key, 1), (num_envs,), 0, env.num_actions)
+        step_keys = jax.random.split(jax.random.fold_in(step_key, step_index), num_envs)
+        action = jax.random.randint(jax.random.fold_in(action_key, step_index), (num_envs,), 0, env.num_actions)
         last_state = state
         step_result = batched_step(step_keys, state, action, params)
         observation, state, reward, terminated, truncated, step_info = step_result

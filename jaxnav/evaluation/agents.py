@@ -38,6 +38,8 @@ from jaxnav.scenes.task import NUM_ACTIONS
 BatchFunction = Callable[[dict[str, np.ndarray]], Any]
 #: Names of the odometry that `act` may take.
 _ODOMETRY = ("heading", "horizon", "moved")
+# Constant folded into the key of an episode for `init`; the time steps folded into it for `act` are smaller.
+_INIT_TAG = 2**30
 
 
 class RandomAgent:
@@ -204,7 +206,8 @@ def _run_step_agent(
         return advance_batch(batch, next_agent, action, result, jnp.zeros(action.shape))
 
     # Every agent starts with its own memory and a key of its own.
-    memory = jax.vmap(functools.partial(_init, agent))(episode_keys)
+    init_keys = jax.vmap(jax.random.fold_in, (0, None))(episode_keys, _INIT_TAG)
+    memory = jax.vmap(functools.partial(_init, agent))(init_keys)
     not_moved = jnp.zeros(num_episodes, bool)
     agent_state = AgentState(memory, not_moved, not_moved, jnp.zeros(num_episodes, jnp.int32))
     start = loop.start_from(states, None, None, env_params)

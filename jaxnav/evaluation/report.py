@@ -423,6 +423,15 @@ def _lines_by_heading(report: dict[str, Any]) -> dict[str, list[tuple[str, ...]]
     return table_lines
 
 
+#: What the label of a row adds for its form of equation 2, unless that is the usual one of the variant.
+FORM_SUFFIXES: dict[Form, str] = {
+    "paper": ", paper form",
+    "residual": ", residual form",
+    "switch": ", switch",
+    "mixture": ", mixture",
+}
+
+
 def row_label(row: dict[str, Any]) -> str:
     """Name of a report's row, as printed in tables."""
     match row["variant"]:
@@ -443,10 +452,10 @@ def row_label(row: dict[str, Any]) -> str:
         case "cde":
             return "+ w + CDE"
         case "scde":
-            form_suffix = {"residual": ", residual form", "switch": ", switch"}.get(row["form"], "")
+            form_suffix = "" if row["form"] == "paper" else FORM_SUFFIXES[row["form"]]
             return f"+ w + sCDE (eps={row['epsilon']:g}){form_suffix}"
         case _:
-            form_suffix = {"paper": ", paper form", "switch": ", switch"}.get(row["form"], "")
+            form_suffix = "" if row["form"] == "residual" else FORM_SUFFIXES[row["form"]]
             return f"+ w + sTDE (eps={row['epsilon']:g}){form_suffix}"
 
 

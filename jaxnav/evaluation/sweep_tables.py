@@ -26,7 +26,7 @@ class ThresholdRow(NamedTuple):
     Attributes:
       shift: layout shift of the scenes.
       epsilon: threshold of sTDE; None for no removal.
-      removed: mean share of experience that is removed, over all steps, in percent.
+      removed: mean weight of the removal in percent, averaged over the decisions of each episode, then over episodes.
       metrics: `sr`, `spl` and `dts`.
       changes: differences of the metrics to no removal, paired on episodes and seeds.
     """
@@ -109,7 +109,7 @@ def sweep_notes(num_seeds: int, episodes: EpisodeList) -> list[str]:
         interval_note = f"95 % intervals over {num_seeds} training seeds and {num_plans} floor plans."
     return [
         interval_note,
-        "Removed: mean share of experience that sTDE removes, over all steps.",
+        "Removed: mean weight s of the removal (eq. 2), averaged within each episode, then over episodes.",
         "Change: difference to no removal in percentage points, paired on episodes and seeds.",
     ]
 

@@ -18,7 +18,7 @@ from typing import Any, Literal, NamedTuple, TypeVar
 import jax
 import numpy as np
 
-from jaxnav.choices import Decoding, Form
+from jaxnav.choices import Decoding, Form, GapName
 from jaxnav.evaluation.episodes import EpisodeList, join_episode_lists
 from jaxnav.evaluation.grid import EpisodeOutcome, episode_metrics
 from jaxnav.evaluation.report import remaining_share
@@ -38,7 +38,7 @@ from jaxnav.experiments.trials import (
     require_estimator_config,
 )
 from jaxnav.layout import EstimatorConfig
-from jaxnav.runs.policies import EVIDENCE_GAPS, GapName, estimators_by_gap, load_policies
+from jaxnav.runs.policies import EVIDENCE_GAPS, estimators_by_gap, load_policies
 from jaxnav.runs.worlds import CompiledWorld, concatenate_worlds
 from jaxnav.scenes.worlds import WORLDS
 
@@ -208,7 +208,7 @@ def _measure_removals(
         metrics=metrics,
         layout_blind=metrics.percent_metrics(outcomes.layout_blind),
         agent=metrics.percent_metrics(outcomes.plain),
-        same_runs=remaining == "own" and run.config.has_additive_scores,
+        same_runs=remaining == "own" and run.config.policy_method.has_additive_scores,
         num_scenes=len(episodes.scenes) // len(shifts),
     )
     yield from report.agent_rows()
@@ -258,7 +258,7 @@ def _run_removals(
     # Where scores are a sum, complete removal leaves an agent without any experience, and no other agent is needed.
     # Else the layout-blind agents meet the same episodes, in as many training runs.
     layout_blind_run = None
-    if not (remaining == "own" and run.config.has_additive_scores):
+    if not (remaining == "own" and run.config.policy_method.has_additive_scores):
         layout_blind_run = require_layout_blind_run(bench, run)
         bench.train(layout_blind_run)
     bench.train(run)

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.choices import Decoding, Form
+from jaxnav.choices import Decoding, Form, GapName
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.grid import EpisodeOutcome, Evaluator, episode_metrics
@@ -30,7 +30,7 @@ from jaxnav.experiments.table import ResultRow
 from jaxnav.layout import EstimatorConfig
 from jaxnav.policies.agent_loop import AgentLoop
 from jaxnav.runs.config import ARMS
-from jaxnav.runs.policies import GapName, Policies, estimators_by_gap, load_policies
+from jaxnav.runs.policies import Policies, estimators_by_gap, load_policies
 from jaxnav.runs.worlds import CompiledWorld
 
 #: Gaps that are independent of the episode: `course` is the mean gap of all episodes at that time; `after` and `until`

@@ -329,6 +329,11 @@ class Method:
     fit: "Fit | None" = None
     name: str = ""
 
+    @property
+    def has_additive_scores(self) -> bool:
+        """True if the scores of the policies are a sum: direct scores plus experience."""
+        return self.policy_class is not None and self.policy_class.has_additive_scores
+
     def __post_init__(self) -> None:
         shares = [stage.share for stage in self.stages]
         if not shares or min(shares) <= 0.0 or abs(sum(shares) - 1.0) > 1e-6:

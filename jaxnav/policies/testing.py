@@ -71,8 +71,8 @@ def check_method(
     spec = PolicySpec(method, len(env.categories), _SIZES, tuple(sorted((method_sizes or {}).items())))
     agent_loop = AgentLoop(env, spec, ESTIMATORS["calibrated"] if method.hosts_layout else None)
     knowledge = _uniform_knowledge(method, env, bank)
-    key = jax.random.key(seed)
-    params = _with_random_actor(jax.jit(init_params, static_argnums=0)(spec, key), key)
+    params_key, actor_key, start_key, choice_key = jax.random.split(jax.random.key(seed), 4)
+    params = _with_random_actor(jax.jit(init_params, static_argnums=0)(spec, params_key), actor_key)
 
     # Rollouts and histories rely on a bound on how long a choice lasts.
     interval = getattr(method.control, "interval", 0)
@@ -82,7 +82,7 @@ def check_method(
     @jax.jit
     def start_episodes() -> Agent:
         memory = agent_loop.bind(params).initial_memory((_BATCH_SIZE,))
-        return agent_loop.start(key, _BATCH_SIZE, memory, knowledge, env_params)
+        return agent_loop.start(start_key, _BATCH_SIZE, memory, knowledge, env_params)
 
     @jax.jit
     def act_once(agent: Agent, step_key: jax.Array) -> tuple[Agent, jax.Array]:
@@ -97,7 +97,7 @@ def check_method(
     agents = [start_episodes()]
     choices: list[jax.Array] = []
     for time in range(steps):
-        agent, choice = act_once(agents[-1], jax.random.fold_in(key, time))
+        agent, choice = act_once(agents[-1], jax.random.fold_in(choice_key, time))
         agents.append(agent)
         choices.append(choice)
         action = policy_memory(agent).action

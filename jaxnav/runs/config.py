@@ -219,12 +219,6 @@ class RunConfig:
         return find_method(self.method)
 
     @property
-    def has_additive_scores(self) -> bool:
-        """True if the scores of the policies are a sum, direct scores plus experience."""
-        policy_class = self.policy_method.policy_class
-        return policy_class is not None and policy_class.has_additive_scores
-
-    @property
     def task(self) -> Task:
         """Task of the world, with the categories, goals and detector of this configuration."""
         task = WORLDS[self.world].task

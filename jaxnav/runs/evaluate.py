@@ -642,8 +642,6 @@ def _load_layout_policies(
     """Load the policies of the arm `layout` of a run, or a single policy; see `sweep`."""
     # A single policy, with one seed.
     if isinstance(source, LoadedPolicy):
-        if setting is not None or hold:
-            raise InputError("setting, hold: give them to jaxnav.load_policy, which loaded this policy")
         config, policies = policy_in_memory_as_run(source)
     elif not isinstance(source, Run) and is_policy(source):
         config, policies = load_policy_as_run(source)

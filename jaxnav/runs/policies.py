@@ -11,13 +11,13 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.choices import CounterfactualMemory, EstimatorName
+from jaxnav.choices import CounterfactualMemory, EstimatorName, GapName
 from jaxnav.env.objectnav import NUM_PRIORS, Observation
 from jaxnav.errors import InputError
 from jaxnav.gaps import NUM_NEAR_FEATURES, CooccurrenceEvidence
@@ -45,10 +45,6 @@ POLICIES_DIR = "policies"
 CONFIG_FILE = "config.json"
 #: Folder of the policies that come with the package, each in a folder of its own.
 PACKAGED_POLICIES = Path(__file__).parents[1] / "weights"
-#: Measures of the layout gap.
-GapName = Literal["novelty", "evidence", "learned", "surprise", "overdue", "clock"]
-
-
 #: Gaps that read the co-occurrence evidence.
 EVIDENCE_GAPS: tuple[str, ...] = ("learned", "surprise", "overdue")
 
@@ -60,7 +56,7 @@ class Policies(NamedTuple):
       params: network parameters, leaves [A S, ...]; the seeds of an arm are adjacent.
       arms: names of the A arms.
       knowledge: priors and method knowledge from before training.
-      prior_counts: float32 [rooms, K, K], co-occurrence counts behind the layout priors.
+      prior_counts: float32 [rooms, K, K], co-occurrence counts behind the layout priors; None for a policy in memory.
       spec: specification of the networks.
       estimator_config: calibrated layout estimator; None without the arm `layout`.
       prior_steps: random steps in which the counts were collected.
@@ -73,7 +69,7 @@ class Policies(NamedTuple):
     params: dict[str, Any]
     arms: tuple[str, ...]
     knowledge: Knowledge
-    prior_counts: jax.Array
+    prior_counts: jax.Array | None
     spec: PolicySpec
     estimator_config: EstimatorConfig | None
     prior_steps: int
@@ -114,8 +110,8 @@ class Policies(NamedTuple):
           hold: keep the gap from falling within an episode.
 
         Raises:
-          InputError: no policy uses the layout, or the run learned no co-occurrence evidence, which `learned`,
-            `surprise` and `overdue` need.
+          InputError: no policy uses the layout, the run learned no co-occurrence evidence, which `learned`, `surprise`
+            and `overdue` need, or the counts that `paper` and `released` need are not in memory.
         """
         if name is None and not hold:
             return self
@@ -131,8 +127,16 @@ class Policies(NamedTuple):
         estimator_config = self.estimator_config
         knowledge = self.knowledge
         if name in ("paper", "released"):
+            if self.prior_counts is None:
+                raise InputError(
+                    f"setting {name!r} needs the counts behind the priors, which a policy in memory lacks; give the "
+                    "policy by its folder or its name"
+                )
             estimator_config = adapt_counts(ESTIMATORS[name], self.task)
             knowledge = knowledge._replace(layout=layout_priors(self.prior_counts, estimator_config))
+            # Removal from a sum has forms of its own.
+            if self.spec.method.has_additive_scores:
+                estimator_config = dataclasses.replace(estimator_config, form=self.estimator_config.form)
         elif name is not None:
             estimator_config = estimators_by_gap(estimator_config)[name]
 
@@ -196,7 +200,8 @@ class Policies(NamedTuple):
           Policies with parameters {"agent": ..., "without": ...}.
 
         Raises:
-          InputError: the fallback policies have a tracker, another number of choices or another spatial memory.
+          InputError: the fallback policies have a tracker, another number of choices or another spatial memory, or are
+            more or fewer.
         """
         # Both policies share choices and spatial memory, and no tracker runs for the fallback policy.
         method = self.spec.method
@@ -208,6 +213,13 @@ class Policies(NamedTuple):
             )
         if self.spec.spatial_memory != fallback_policies.spec.spatial_memory:
             raise InputError("hand-over: the runs have different spatial memories; train both with the same settings")
+        num_policies = len(jax.tree.leaves(self.params)[0])
+        num_fallbacks = len(jax.tree.leaves(fallback_policies.params)[0])
+        if num_policies != num_fallbacks:
+            raise InputError(
+                f"hand-over: {num_policies} policies cannot hand over to {num_fallbacks}; train both runs with equal "
+                "arms and seeds"
+            )
         paired_params = {"agent": self.params, "without": fallback_policies.params}
         return self._replace(params=paired_params, fallback_spec=fallback_policies.spec)
 

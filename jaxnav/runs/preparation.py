@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxnav.errors import InputError
 from jaxnav.layout import EstimatorConfig
 from jaxnav.policies.method import Knowledge
 from jaxnav.policies.network import Params
@@ -84,7 +83,7 @@ def load_preparation(run_dir: Path, manifest: Mapping[str, Any]) -> Preparation 
         knowledge = knowledge_from_arrays(arrays)
         seed_params = arrays.get("fitted", {})
         fitted_params = tuple(jax.tree.map(jnp.asarray, seed_params[str(seed)]) for seed in range(len(seed_params)))
-    except (InputError, KeyError, TypeError):
+    except (KeyError, TypeError, ValueError):  # an `InputError` is a `ValueError`
         return None
     check_manifest(folder, stored_manifest, manifest)
     return Preparation(exploration, estimator_config, knowledge, fitted_params)

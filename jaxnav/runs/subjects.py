@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 
 from jaxnav.errors import InputError
 from jaxnav.evaluation.agents import is_agent
@@ -82,6 +81,8 @@ def find_subject(subject: Any) -> PolicySubject | AgentSubject:
     if isinstance(subject, list | tuple) and not is_agent(subject):
         if not subject:
             raise InputError("the list of agents is empty; give at least one agent")
+        if any(isinstance(member, LoadedPolicy) for member in subject):
+            raise InputError("a list of policies is no agent; give one policy at a time, or the run that they are of")
         return AgentSubject(_agent_name(subject[0]), tuple(subject))
     return AgentSubject(_agent_name(subject), (subject,))
 
@@ -157,7 +158,7 @@ def policy_in_memory_as_run(policy: LoadedPolicy) -> tuple[RunConfig, Policies]:
         params=jax.tree.map(lambda leaf: leaf[None], policy.params),
         arms=config.arms,
         knowledge=policy.knowledge,
-        prior_counts=jnp.zeros_like(policy.knowledge.layout),  # only needed to replace the estimator
+        prior_counts=None,
         spec=policy.spec,
         estimator_config=policy.estimator_config,
         prior_steps=0,

@@ -396,7 +396,7 @@ def calibrate_estimator(
     Values that the run's configuration leaves open are calibrated in the training scenes of the first bank.
     """
     estimator_config = named_estimator(config)
-    if config.has_additive_scores:
+    if config.policy_method.has_additive_scores:
         estimator_config = dataclasses.replace(estimator_config, form="paper")  # removes from a sum
     if estimator_config.strength is None:
         return estimator_config  # `paper` and `released` keep the sums of the counts, so nothing is calibrated

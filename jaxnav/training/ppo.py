@@ -231,7 +231,8 @@ def collect_rollout(
       redraw_every_step: redraw the experience dropout at every step, not only where an episode begins.
 
     Returns:
-      The agents after the rollout, and the rollout. Its bootstrap values always use both direct pathways.
+      The agents after the rollout, and the rollout. Values after a truncation and after the last step always use both
+      direct pathways; within an episode the bootstrap value is that of the next step, with its coin.
     """
     num_envs = agent.state.pose.shape[0]
 

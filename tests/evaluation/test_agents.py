@@ -74,6 +74,20 @@ def test_all_kinds_of_agents_give_equal_outcomes():
         jax.tree.map(np.testing.assert_array_equal, outcome, run(other_agent))
 
 
+def test_the_key_of_init_is_none_of_the_keys_of_act():
+    """An agent may split the key of `init` itself; `split(key, n)[i]` equals `fold_in(key, i)`."""
+
+    class KeyKeeper:
+        def init(self, key):
+            return {"time": jnp.int32(0), "later_keys": jax.random.key_data(jax.random.split(key, 16))}
+
+        def act(self, observation, memory, key):
+            is_repeated = (jax.random.key_data(key)[None] == memory["later_keys"]).all(axis=-1).any()
+            return jnp.where(is_repeated, DONE, MOVE_AHEAD), memory
+
+    assert not run(KeyKeeper()).done.any()
+
+
 def test_done_succeeds_where_the_shortest_path_has_length_one():
     outcome = run(lambda observations: np.full(len(observations["goal"]), DONE))
     np.testing.assert_array_equal(outcome.success, EPISODES.best_length == 1)

@@ -1,10 +1,12 @@
 """The report's tables, for a terminal and in Markdown."""
 
 import io
+from typing import get_args
 
 import pytest
 from rich.console import Console
 
+from jaxnav.choices import Form
 from jaxnav.evaluation import report as report_tables
 
 ROW = {"variant": "baseline", "method": "ORG", "world": "ithor", "split": "test"}
@@ -96,6 +98,12 @@ def test_difference_table_has_a_line_per_comparison():
     report["differences"][0]["probability_of_improvement"] = {"mean": 0.625, "ci95": [0.5, 0.75]}
     *_, column = report_tables.difference_table(report).columns
     assert list(column.cells) == ["0.62 [0.50, 0.75]"]
+
+
+@pytest.mark.parametrize("variant", ["stde", "scde"])
+def test_rows_of_different_forms_have_different_labels(variant):
+    rows = [{"variant": variant, "epsilon": 0.5, "form": form} for form in get_args(Form)]
+    assert len({report_tables.row_label(row) for row in rows}) == len(rows) == 4
 
 
 def make_share(part, share, partner_difference, cost):

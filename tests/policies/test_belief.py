@@ -444,7 +444,7 @@ def test_predictor_of_the_page_scores_by_its_weights():
 
 def test_a_home_larger_than_the_map_is_refused():
     bank = compile_bank([corridor_scene(90)], Task(CATEGORIES))
-    with pytest.raises(InputError, match=r"method belief: scene drawn needs a map of 101 x 101 cells.* 96 x 96"):
+    with pytest.raises(InputError, match=r"search on a map: scene drawn needs a map of 101 x 101 cells.* 96 x 96"):
         check_belief_map(Knowledge(jnp.zeros((5, 3, 3))), bank)
     check_belief_map(Knowledge(jnp.zeros((5, 3, 3))), tiny.BANK)
 

@@ -260,3 +260,10 @@ def test_what_cannot_be_handed_over_to_is_refused(changes, remedy):
     other = dataclasses.replace(ANONYMOUS, **{"spatial_memory": own.spatial_memory} | changes)
     with pytest.raises(InputError, match=remedy):
         policies(own, AGENT).with_handover_to(policies(other, WITHOUT))
+
+
+def test_a_hand_over_needs_equally_many_policies():
+    one = jax.tree.map(lambda leaf: leaf[None], AGENT)
+    two = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), WITHOUT)
+    with pytest.raises(InputError, match="1 policies cannot hand over to 2; train both runs with equal arms and seeds"):
+        policies(tiny.SPEC, one).with_handover_to(policies(ANONYMOUS, two))

@@ -236,9 +236,11 @@ def test_transformer_refuses_impossible_sizes(sizes, message):
 def test_imitation_loss_is_the_cross_entropy_to_the_expert():
     logits = jnp.log(jnp.array([[1.0, 1, 1, 1, 1, 1], [3, 1, 1, 1, 1, 1], [1, 1, 1, 1, 1, 3]]))
     loss, parts = imitation_loss(logits, jnp.array([2, 0, 6]))
-    # log 6, log (8 / 3), and nothing from where there is no way; the likeliest is right in the second alone.
+    # log 6, log (8 / 3), and nothing from where there is no way; of the two others the likeliest is right in one.
     assert loss == pytest.approx((np.log(6) + np.log(8 / 3)) / 3, rel=1e-6)
-    assert parts["imitation_agreement"] == pytest.approx(1 / 3)
+    assert parts["imitation_agreement"] == pytest.approx(1 / 2)
+    _, parts_without_way = imitation_loss(logits, jnp.array([6, 6, 6]))
+    assert parts_without_way["imitation_agreement"] == 0
 
 
 @pytest.mark.exhaustive

@@ -205,5 +205,16 @@ def test_sweep_refuses_what_is_no_run_and_no_layout_policy(drawn_run, tmp_path):
     for baseline in (baseline_folder, jaxnav.load_policy(baseline_folder)):
         with pytest.raises(InputError, match="a policy of the arm 'baseline', which does not use the layout"):
             jaxnav.sweep(baseline)
-    with pytest.raises(InputError, match=r"give them to jaxnav\.load_policy"):
-        jaxnav.sweep(jaxnav.load_policy("rooms-org"), setting="evidence")
+
+
+def test_a_policy_in_memory_has_no_counts_for_the_priors_of_other_estimators():
+    policy = jaxnav.load_policy("rooms-org")
+    for measure in (jaxnav.sweep, jaxnav.evaluate):
+        with pytest.raises(InputError, match=r"setting 'paper' needs the counts behind the priors, .* by its folder"):
+            measure(policy, setting="paper")
+
+
+def test_a_list_of_policies_is_no_agent():
+    policy = jaxnav.load_policy("rooms-org")
+    with pytest.raises(InputError, match="give one policy at a time"):
+        jaxnav.evaluate([policy, policy])

@@ -395,7 +395,7 @@ def check_belief_map(knowledge: Knowledge, bank: Bank) -> None:
     for scene_name, required_size in required_map_sizes(bank).items():
         if required_size > MAP_CELLS:
             raise InputError(
-                f"method belief: scene {scene_name} needs a map of {required_size} x {required_size} cells, but the "
+                f"search on a map: scene {scene_name} needs a map of {required_size} x {required_size} cells, but the "
                 f"map has {MAP_CELLS} x {MAP_CELLS}; leave the scene out"
             )
 

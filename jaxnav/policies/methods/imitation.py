@@ -30,10 +30,11 @@ def imitation_loss(logits: jax.Array, expert: jax.Array) -> tuple[jax.Array, dic
         the loss.
 
     Returns:
-      The loss float32 [], and by name the loss and the share of steps at which the likeliest action is the expert's.
+      The loss float32 [], and by name the loss and the share of steps with an action of the expert at which it is the
+      likeliest; 0 without such steps.
     """
     # The one-hot row of `NUM_ACTIONS` is zero.
     expert_one_hot = jax.nn.one_hot(expert, logits.shape[-1], dtype=jnp.float32)
     loss = -(expert_one_hot * jax.nn.log_softmax(logits)).sum(axis=-1).mean()
-    agreement = (logits.argmax(axis=-1) == expert).astype(jnp.float32).mean()
+    agreement = (logits.argmax(axis=-1) == expert).sum() / jnp.maximum((expert < logits.shape[-1]).sum(), 1)
     return loss, {"imitation_loss": loss, "imitation_agreement": agreement}

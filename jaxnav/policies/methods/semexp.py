@@ -130,10 +130,10 @@ def learn_search_setup(banks: Iterable[Bank], counts: np.ndarray) -> dict[str, n
     rules = task.rules
     if len(task.categories) > MAX_CATEGORIES:
         problem = f"the task has {len(task.categories)} categories, but a map holds at most {MAX_CATEGORIES}"
-        raise InputError(f"method semexp: {problem}; give fewer categories")
+        raise InputError(f"search on a map: {problem}; give fewer categories")
     if len(np.unique(rules.move_steps(), axis=0)) < len(NEIGHBOURS):
         problem = f"the task has {rules.headings} headings, but paths lead to eight neighbours"
-        raise InputError(f"method semexp: {problem}; give 8 or 12 headings")
+        raise InputError(f"search on a map: {problem}; give 8 or 12 headings")
 
     # The map holds the largest home; its size is rounded up to whole words.
     required_size = WORD_BITS
@@ -162,7 +162,7 @@ def check_map_size(knowledge: Knowledge, bank: Bank) -> None:
     for scene_name, required_size in required_map_sizes(bank).items():
         if required_size > map_size:
             raise InputError(
-                f"method semexp: scene {scene_name} needs a map of {required_size} x {required_size} cells, but the "
+                f"search on a map: scene {scene_name} needs a map of {required_size} x {required_size} cells, but the "
                 f"map of the training homes has {map_size} x {map_size}; train in homes of that size"
             )
 
