@@ -227,15 +227,15 @@ def table_header(*titles: Any, text_columns: int = 1) -> str:
 def verdict(effect: Interval, min_effect: float) -> str:
     """Verdict on a claim that an effect is above 0.
 
-    An interval below 0 refutes the claim; one below `min_effect`, the least effect that would matter, shows that no
-    effect that would matter supports the claim; one above 0 confirms the claim; all others leave it open.
+    An interval below 0 refutes the claim; one below `min_effect`, the least effect that would matter, excludes such an
+    effect, whatever its own sign; one above 0 confirms the claim; all others leave it open.
     """
     if math.isnan(effect.mean):
         return "not measured"
     if effect.high < 0:
         return "refuted"
     if effect.high < min_effect:
-        return "too small to matter"
+        return "excluded"
     return "holds" if effect.low > 0 else "inconclusive"
 
 

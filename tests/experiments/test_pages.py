@@ -73,10 +73,10 @@ def read_lines(text: str) -> dict[str, list[str]]:
     [
         (0.5, 3.0, "holds"),
         (2.5, 3.0, "holds"),
-        (0.5, 1.5, "too small to matter"),  # whatever its sign
-        (-1.0, 1.5, "too small to matter"),
+        (0.5, 1.5, "excluded"),  # whatever its sign
+        (-1.0, 1.5, "excluded"),
         (-4.0, -1.0, "refuted"),
-        (-4.0, 0.0, "too small to matter"),  # 0 is within the interval
+        (-4.0, 0.0, "excluded"),  # 0 is within the interval
         (-1.0, 2.5, "inconclusive"),
         (0.0, 2.5, "inconclusive"),
         (-1.0, 2.0, "inconclusive"),  # what would matter is within the interval, too
@@ -89,7 +89,7 @@ def test_a_verdict_compares_the_interval_with_zero_and_the_least_effect(low, hig
 
 def test_without_an_effect_the_verdict_says_so():
     undefined = verdict(Interval(math.nan), min_effect=2.0)
-    assert undefined not in ("holds", "refuted", "too small to matter")
+    assert undefined not in ("holds", "refuted", "excluded")
 
 
 def test_undefined_values_are_dashes():
@@ -318,8 +318,8 @@ CLAIMS = [
     ("where the similarity is low", 2.5, 0.25, "holds"),  # -2.5 points per 0.1 more similarity
     ("gap is below 0.5", 0.3, 0.01, "holds"),  # 0.5 - 0.2
     ("Without updates of the belief", 0.3, 0.01, "holds"),  # 0.8 - 0.5
-    ("eq. 5 detects shift 1 at step 0", 0.0, 0.01, "too small to matter"),  # an AUC of 0.5 is chance
-    ("eq. 5 detects shift 1 at step 20", 0.0, 0.01, "too small to matter"),
+    ("eq. 5 detects shift 1 at step 0", 0.0, 0.01, "excluded"),  # an AUC of 0.5 is chance
+    ("eq. 5 detects shift 1 at step 20", 0.0, 0.01, "excluded"),
     ("The `evidence` gap detects", 0.25, 0.01, "holds"),
     ("Experience has a value", 8.0, 1.0, "holds"),
     ("Experience has a cost", 7.0, 1.0, "holds"),
@@ -516,7 +516,7 @@ def test_orderings_are_judged_by_their_intervals(tmp_path):
 
     # Hosts: what the paper's Table 1 says of ORG, 71.40 - 66.48, its Table 2, 74.85 - 66.53, and 71.40 - 69.24.
     assert cells["rooms: `org` + w over `org`"] == ["+4.9", "+5.0 [+4.0, +6.0]", "holds"]
-    assert cells["rooms: `org` + w + sTDE over `org`"][1:] == ["+0.5 [-0.5, +1.5]", "too small to matter"]
+    assert cells["rooms: `org` + w + sTDE over `org`"][1:] == ["+0.5 [-0.5, +1.5]", "excluded"]
     assert cells["rooms: `org` + w over `org` + w + TDE"] == ["+2.2", "-5.0 [-6.0, -4.0]", "refuted"]
     assert cells["rooms: `hoz` + w over `hoz`"][1:] == ["+1.0 [-2.0, +4.0]", "inconclusive"]
 

@@ -20,7 +20,7 @@ SCENE, RUN, BOTH, EPISODE = 0.9, 0.1, 0.25, 1.2
 #: Logit of success by room type.
 LEVELS = 1.6 + 0.4 * np.arange(ROOMS)
 
-VERDICTS = ("holds", "inconclusive", "too small to matter", "refuted")
+VERDICTS = ("holds", "inconclusive", "excluded", "refuted")
 
 Rule = Callable[[np.ndarray, np.ndarray, np.random.Generator], Interval]
 
