@@ -3,8 +3,12 @@
 The command line reads these types to show its help, so this module must not import JAX.
 """
 
-from typing import Literal
+from typing import Literal, get_args
 
+#: Generated worlds, whose rules imported scenes follow.
+WorldName = Literal["rooms", "apartments", "houses"]
+#: Splits of the scenes of a world.
+Split = Literal["train", "val", "test"]
 #: Form in which equation 2 combines the logits, see `jaxnav.causal.stde`.
 Form = Literal["paper", "residual", "switch", "mixture"]
 #: Reduction over the rows' divergences in eq. 5: the mean over visible rows, the mean over all K, or the sum.
@@ -31,5 +35,6 @@ CounterfactualMemory = Literal["factual", "own"]
 ShiftKind = Literal["size", "context"]
 #: Rule that turns logits into actions: the best action, or a sampled one.
 Decoding = Literal["argmax", "sample"]
+DECODINGS: tuple[Decoding, ...] = get_args(Decoding)
 #: Decoding of a row: that of its policies, or the agent's own way to choose actions.
 RowDecoding = Literal["argmax", "sample", "own"]

@@ -2,11 +2,10 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
 
 from rich.console import Console
 
-from jaxnav.choices import EstimatorName, PlayedVariant, ShiftKind
+from jaxnav.choices import EstimatorName, PlayedVariant, ShiftKind, Split
 from jaxnav.cli.console import parse_arguments, run_command
 from jaxnav.errors import InputError
 from jaxnav.progress import show_activity
@@ -45,7 +44,7 @@ class EpisodeConfig:
     """
 
     source: str
-    split: Literal["train", "val", "test"] = "val"
+    split: Split = "val"
     index: int = 0
     out: Path | None = None
     variant: tuple[PlayedVariant, ...] = ("stde",)

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from rich.console import Console
 
-from jaxnav.choices import Costs, CounterfactualMemory, EstimatorName, Form, Removal, ShiftKind
+from jaxnav.choices import Costs, CounterfactualMemory, EstimatorName, Form, Removal, ShiftKind, Split, WorldName
 from jaxnav.cli.console import (
     make_result_console,
     name_evaluation,
@@ -84,9 +84,9 @@ class EvalConfig:
     """
 
     subject: str
-    split: Literal["train", "val", "test"] = "val"
+    split: Split = "val"
     scenes: Path | None = None
-    world: Literal["rooms", "apartments", "houses"] | None = None
+    world: WorldName | None = None
     shift: float | None = None
     shift_by: ShiftKind = "size"
     episodes: int = 1000

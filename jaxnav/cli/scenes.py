@@ -6,10 +6,11 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
+from jaxnav.choices import Split, WorldName
 from jaxnav.cli.console import (
     HELP_OPTIONS,
     make_result_console,
@@ -20,7 +21,7 @@ from jaxnav.cli.console import (
 )
 from jaxnav.errors import InputError
 from jaxnav.plain_console import escape_control_chars
-from jaxnav.scenes.files.importing import SceneFormat, SceneSplit
+from jaxnav.scenes.files.importing import SceneFormat
 from jaxnav.scenes.worlds import WORLDS, SceneSource
 
 if TYPE_CHECKING:
@@ -61,12 +62,12 @@ class ImportConfig:
     format: SceneFormat
     source: str
     out: Path
-    split: SceneSplit = "train"
+    split: Split = "train"
     val: tuple[str, ...] = ()
     test: tuple[str, ...] = ()
     room_types: tuple[str, ...] = ()
     largest: int | None = None
-    world: Literal["rooms", "apartments", "houses"] | None = None
+    world: WorldName | None = None
     categories: tuple[str, ...] | None = None
     assets: Path | None = None
     agent_part: bool = False

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from rich.console import Console
 
-from jaxnav.choices import Decoding, EstimatorName, Form, ShiftKind
+from jaxnav.choices import Decoding, EstimatorName, Form, ShiftKind, Split, WorldName
 from jaxnav.cli.console import (
     make_result_console,
     name_evaluation,
@@ -71,9 +71,9 @@ class SweepConfig:
     epsilon: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
     shift: tuple[float, ...] = (0.0, 1.0)
     shift_by: ShiftKind = "size"
-    split: Literal["train", "val", "test"] = "val"
+    split: Split = "val"
     scenes: Path | None = None
-    world: Literal["rooms", "apartments", "houses"] | None = None
+    world: WorldName | None = None
     episodes: int = 1000
     decoding: Decoding = "argmax"
     form: Form | None = None

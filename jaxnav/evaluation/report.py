@@ -79,7 +79,7 @@ def build_row(
     """
     scaled_metrics = {}
     for metric_name, metric_values in metrics.items():
-        scaled_metrics[metric_name] = _to_report_units(metric_name, metric_values)
+        scaled_metrics[metric_name] = to_report_units(metric_name, metric_values)
 
     # Each metric with its interval, bucket by bucket.
     buckets: dict[str, dict[str, Any]] = {}
@@ -148,8 +148,8 @@ def build_difference(
     compared_name, compared_results = compared
 
     # The difference is taken episode by episode, over all lengths L*.
-    reference_values = _to_report_units(metric, reference_results)
-    compared_values = _to_report_units(metric, compared_results)
+    reference_values = to_report_units(metric, reference_results)
+    compared_values = to_report_units(metric, compared_results)
     clusters = episodes.clusters()
     paired = paired_difference(reference_values, compared_values, clusters, same_runs=same_runs, trained=trained)
 
@@ -214,8 +214,16 @@ def write_report(path: Path, report: dict[str, Any]) -> None:
     write_atomic(path, (json.dumps(report, indent=2, allow_nan=False) + "\n").encode())
 
 
-def _to_report_units(metric: str, metric_values: np.ndarray) -> np.ndarray:
-    """Check results and convert fractions to percent; `dts` stays in metres."""
+def to_report_units(metric: str, metric_values: np.ndarray) -> np.ndarray:
+    """Check results and convert fractions to percent; `dts` stays in metres.
+
+    Args:
+      metric: name of a metric of `jaxnav.evaluation.grid.episode_metrics`.
+      metric_values: its values, [...].
+
+    Raises:
+      InputError: a value is NaN or out of range.
+    """
     # Only the distance to success is not a fraction of episodes.
     metric_values = np.asarray(metric_values, np.float64)
     is_distance = metric == "dts"

@@ -11,7 +11,7 @@ import numpy as np
 from rich.table import Table
 
 from jaxnav.evaluation.episodes import EpisodeList
-from jaxnav.evaluation.report import METRIC_COLUMNS
+from jaxnav.evaluation.report import METRIC_COLUMNS, to_report_units
 from jaxnav.evaluation.statistics import MIN_SCENE_DEGREES, Interval, mean_interval, paired_difference
 
 #: Metrics that are printed; files hold all metrics of `METRIC_COLUMNS`.
@@ -74,9 +74,8 @@ def threshold_rows(
         intervals = {}
         changes = {}
         for name in METRIC_COLUMNS:
-            scale = 1.0 if name == "dts" else 100.0
-            values = scale * row_metrics[name]
-            reference_values = scale * reference_metrics[name]
+            values = to_report_units(name, row_metrics[name])
+            reference_values = to_report_units(name, reference_metrics[name])
             has_seeds = len(values) > 1
             intervals[name] = mean_interval(values, clusters, trained=has_seeds)
             changes[name] = paired_difference(reference_values, values, clusters, same_runs=True, trained=has_seeds)

@@ -16,6 +16,7 @@ from rich.console import Console
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
 from jaxnav.evaluation.grid import EpisodeOutcome
+from jaxnav.evaluation.report import to_report_units
 from jaxnav.evaluation.variants import EvaluationRow
 from jaxnav.experiments.config import AgentRun, ExperimentConfig, agent_runs
 from jaxnav.experiments.table import ResultRow, ResultTable, read_part
@@ -139,7 +140,10 @@ class Bench:
           InputError: the scenes fill more than one shard.
         """
         if len(world.banks) > 1:
-            raise InputError("takes as many scenes of a split as fit into one shard; give more worlds.shard_scenes")
+            raise InputError(
+                f"split {self.config.split}: its {len(world.scenes)} scenes fill {len(world.banks)} shards, but a "
+                f"measurement needs one; set worlds.shard_scenes to {len(world.scenes)} or more"
+            )
         num_episodes = -(-self.config.episodes // num_folds)  # rounded up
         return draw_episodes(world.banks[0], num_episodes, self.config.seed)
 
@@ -172,7 +176,7 @@ class Bench:
         for index, row in enumerate(results.rows):
             row_metrics = {}
             for name, values in metrics.items():
-                row_metrics[name] = values[index] * (1.0 if name == "dts" else 100.0)
+                row_metrics[name] = to_report_units(name, values[index])
             metrics_by_row[row] = row_metrics
         return Scores(metrics_by_row, results.episodes, results)
 

@@ -13,9 +13,9 @@ import json
 import operator
 import re
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
-from jaxnav.choices import Decoding, Form, ShiftKind, Variant
+from jaxnav.choices import Decoding, Form, ShiftKind, Split, Variant
 from jaxnav.errors import InputError
 from jaxnav.runs.config import RunConfig, check_config
 from jaxnav.runs.config_files import apply_values
@@ -95,7 +95,7 @@ class ExperimentConfig:
     groups: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)
     reference: str | None = None
     run: Path | None = None
-    split: Literal["train", "val", "test"] = "val"
+    split: Split = "val"
     shifts: tuple[float, ...] = (0.0, 1.0)
     shift_by: ShiftKind = "size"
     episodes: int = 1000
@@ -181,9 +181,12 @@ def check_experiment(config: ExperimentConfig) -> ExperimentConfig:
         raise InputError("decodings: empty: give one or more")
 
     # Names become parts of file names, and a slash separates an agent from its variant.
-    for name in (*config.worlds, *config.folds, *config.agents):
-        if not re.fullmatch(r"[\w.+:-]+", name):
-            raise InputError(f"worlds and agents: {name!r}: is part of file names; give letters, digits, '-' and '_'")
+    for field in ("worlds", "folds", "agents"):
+        for name in getattr(config, field):
+            if not re.fullmatch(r"[\w.+:-]+", name):
+                raise InputError(
+                    f"{field}: {name!r}: is part of file names; give letters, digits and the characters . _ + : -"
+                )
     _check_folds(config)
     for measurement, patterns in config.measure.items():
         if not isinstance(patterns, list) or not all(isinstance(pattern, str) for pattern in patterns):

@@ -86,8 +86,8 @@ class RemovalRule(NamedTuple):
         return f"{self.gap}{suffix}, {self.options.form}, eps {self.options.epsilon:g}"
 
 
-#: Soft removal by every gap, then switches, which with `held` hand over for the rest of the episode. Rules of the gap
-#: `surprise` are left out for runs without its evidence.
+#: Soft removal by every gap, then switches, which with `held` hand over for the rest of the episode. Runs that lack the
+#: evidence of a gap leave out its rules.
 REMOVAL_RULES = (
     RemovalRule("novelty", False, StdeOptions(0.5, "residual")),
     RemovalRule("novelty", False, StdeOptions(0.0, "paper")),
@@ -379,7 +379,9 @@ def list_fixed_trials(decoding: Decoding, budget: int) -> dict[str, Trial]:
     for control in ("after", "until"):
         for time_share in CLOCK_TIMES:
             clock_step = round(time_share * budget)
-            trials_by_name[f"{control} step {clock_step}"] = Trial("stde", decoding, 0.0, "paper", control, clock_step)
+            trials_by_name[f"{control} step {clock_step}"] = Trial(
+                "stde", decoding, epsilon=0.0, form="paper", control=control, step=clock_step
+            )
     return trials_by_name
 
 

@@ -12,12 +12,12 @@ import jax
 import numpy as np
 
 from jaxnav.baselines.frontier import run_frontier_search
-from jaxnav.choices import Decoding
+from jaxnav.choices import DECODINGS, Decoding
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, join_episode_lists
 from jaxnav.evaluation.grid import episode_metrics
 from jaxnav.evaluation.notes import last_quarter_success
-from jaxnav.evaluation.report import UNTRAINED_VARIANTS
+from jaxnav.evaluation.report import UNTRAINED_VARIANTS, to_report_units
 from jaxnav.evaluation.statistics import Interval, mean_interval, paired_difference
 from jaxnav.evaluation.variants import EvaluationRow
 from jaxnav.experiments.bench import Bench, Scores
@@ -28,7 +28,6 @@ from jaxnav.policies.methods import find_method
 from jaxnav.runs.evaluate import draw_episode_lists, has_same_episodes, measure_leads
 from jaxnav.runs.run import Run
 
-DECODINGS: tuple[Decoding, ...] = ("argmax", "sample")
 METRICS = ("sr", "spl", "dts")
 #: Comparisons within a run: a variant and its reference.
 VARIANT_COMPARISONS = (("layout", "baseline"), ("stde", "layout"), ("stde", "baseline"), ("tde", "layout"))
@@ -238,8 +237,8 @@ def measure_frontier(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
         episodes = join_episode_lists(episode_lists)
         metrics = episode_metrics(outcome, episodes.best_length)
         for metric in METRICS:
-            scale = 1.0 if metric == "dts" else 100.0
-            interval = mean_interval(scale * metrics[metric], episodes.clusters(), trained=False)
+            values = to_report_units(metric, metrics[metric])
+            interval = mean_interval(values, episodes.clusters(), trained=False)
             yield ResultRow(
                 world=run.world,
                 run=run.agent,

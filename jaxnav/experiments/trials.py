@@ -14,12 +14,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.choices import Decoding, Form, GapName
+from jaxnav.choices import DECODINGS, Decoding, Form, GapName
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.grid import EpisodeOutcome, Evaluator, episode_metrics
 from jaxnav.evaluation.removal import GapSource, InferenceConfig, RemovedLogits
 from jaxnav.evaluation.replacements import ReplacedPart
+from jaxnav.evaluation.report import METRIC_COLUMNS, to_report_units
 from jaxnav.evaluation.similarity import cooccurrence_counts
 from jaxnav.evaluation.statistics import Interval, SharedDesign, mean_interval, paired_difference
 from jaxnav.evaluation.variants import inference_grid, table_row
@@ -50,9 +51,7 @@ REPLACED_PARTS: Mapping[str, ReplacedPart] = {
 }
 TrialVariant = Literal["baseline", "layout", "tde", "stde"]
 
-DECODINGS: tuple[Decoding, ...] = ("argmax", "sample")
 GAPS: tuple[GapName, ...] = ("novelty", "evidence", "clock")
-METRIC_SCALE: Mapping[str, float] = {"sr": 100.0, "spl": 100.0, "dts": 1.0}
 #: A step that no episode reaches.
 NEVER = 2**30
 
@@ -435,7 +434,7 @@ class TrialOutcomes:
                 continue
             trial_fields = {**fields, **trial.row_fields(), "gap": gap, "scenes": num_scenes}
             yield ResultRow(**trial_fields, metric="weight", value=Interval(mean_removal_weight(outcome)))
-            for metric in METRIC_SCALE:
+            for metric in METRIC_COLUMNS:
                 interval = mean_interval(self._values(trial, metric), self._clusters)
                 yield ResultRow(**trial_fields, metric=metric, value=interval)
 
@@ -453,7 +452,7 @@ class TrialOutcomes:
 
     def _values(self, trial: Trial, metric: str) -> np.ndarray:
         """Results [S, E] of a trial in percent, or metres."""
-        return METRIC_SCALE[metric] * self._metrics[trial][metric]
+        return to_report_units(metric, self._metrics[trial][metric])
 
 
 class SceneSums(NamedTuple):

@@ -2,9 +2,8 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
 
-from jaxnav.choices import ShiftKind
+from jaxnav.choices import ShiftKind, Split, WorldName
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,9 +24,9 @@ class PlayConfig:
       epsilon: threshold of sTDE in the advice of the policy, at least 0.
     """
 
-    world: Literal["rooms", "apartments", "houses"] = "rooms"
+    world: WorldName = "rooms"
     scenes: Path | None = None
-    split: Literal["train", "val", "test"] = "val"
+    split: Split = "val"
     goal: str | None = None
     seed: int = 0
     shift: float = 0.0

@@ -2,9 +2,8 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
 
-from jaxnav.choices import ShiftKind
+from jaxnav.choices import ShiftKind, Split
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,7 +29,7 @@ class ReportConfig:
 
     run: Path
     reference: Path | None = None
-    split: Literal["train", "val", "test"] = "val"
+    split: Split = "val"
     shift: tuple[float, ...] = (0.0, 1.0)
     shift_by: ShiftKind = "size"
     episodes: int = 1000

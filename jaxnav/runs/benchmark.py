@@ -14,17 +14,17 @@ import io
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
 from rich.console import Console
 from rich.table import Table
 
-from jaxnav.choices import ShiftKind
+from jaxnav.choices import ShiftKind, Split, WorldName
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, join_episode_lists
-from jaxnav.evaluation.report import UNTRAINED_VARIANTS, package_versions, row_label
+from jaxnav.evaluation.report import UNTRAINED_VARIANTS, package_versions, row_label, to_report_units
 from jaxnav.evaluation.statistics import Interval, mean_interval
 from jaxnav.evaluation.variants import EvaluationRow
 from jaxnav.plain_console import to_plain_console
@@ -70,7 +70,7 @@ class Track:
     """
 
     name: str
-    world: Literal["rooms", "apartments", "houses"]
+    world: WorldName
     num_scenes: int
     checksums: tuple[str, ...]
     goals: tuple[str, ...] | None = None
@@ -93,7 +93,7 @@ class Benchmark:
     """
 
     name: str
-    split: Literal["train", "val", "test"]
+    split: Split
     scene_seed: int
     num_episodes: int
     episode_seed: int
@@ -309,8 +309,8 @@ def _score_rows(track_results: Sequence[TrackResults], subject: str, has_runs: b
                 scores = {}
                 for metric in group_metrics[0]:
                     values = np.concatenate([metrics[metric][row_index] for metrics in group_metrics], axis=-1)
-                    scale = 1.0 if metric == "dts" else 100.0
-                    scores[metric] = mean_interval(scale * values, clusters, trained=is_trained).to_json()
+                    values = to_report_units(metric, values)
+                    scores[metric] = mean_interval(values, clusters, trained=is_trained).to_json()
                 score_rows.append({"track": track.name, "shift": shift, "method": subject, **row._asdict(), **scores})
     return score_rows
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from jaxnav.choices import CounterfactualMemory, Counts, Reduction
+from jaxnav.choices import CounterfactualMemory, Counts, Reduction, WorldName
 from jaxnav.errors import InputError
 from jaxnav.policies.spec import DecisionKind, Direct, PolicySpec, Sizes, WeightKind
 from jaxnav.scenes.tables.observation_row import Detector
@@ -175,7 +175,7 @@ class RunConfig:
 
     run_dir: Path = Path("runs/rooms")
     method: str = "org"
-    world: Literal["rooms", "apartments", "houses"] = "rooms"
+    world: WorldName = "rooms"
     scenes: Path | None = None
     arms: tuple[Arm, ...] = ARMS
     seeds: int = 3

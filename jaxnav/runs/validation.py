@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import numpy as np
 
-from jaxnav.choices import Decoding
+from jaxnav.choices import DECODINGS
 from jaxnav.env.objectnav import EnvParams
 from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
 from jaxnav.evaluation.grid import EpisodeOutcome, Evaluator, episode_metrics
@@ -35,7 +35,6 @@ _LOGGED_METRICS = {"val_success": "sr", "val_spl": "spl", "val_timeout": "timeou
 #: Numbers of actions within which success is counted.
 _ACTION_BUDGETS = (5, 10, 15, 20, 30, 40, 50, 75, 100, 150, 200, 300, 400, 500)
 
-DECODINGS: tuple[Decoding, ...] = ("argmax", "sample")
 ValidationSplit = Literal["val", "train"]
 VALIDATION_SPLITS: tuple[ValidationSplit, ...] = ("val", "train")
 #: Parameters of every seed, by arm.

@@ -11,11 +11,11 @@ import functools
 import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Protocol
 
 import numpy as np
 
-from jaxnav.choices import ShiftKind
+from jaxnav.choices import ShiftKind, Split, WorldName
 from jaxnav.errors import InputError, MissingSplitError
 from jaxnav.scenes.context_exchange import ContextExchange, fit_context_exchange
 from jaxnav.scenes.files.scene_file import iterate_scenes, read_bytes, read_scenes, remove_headers
@@ -339,11 +339,11 @@ class SceneSource:
     """
 
     file: str
-    split: Literal["train", "val", "test"] | None = None
+    split: Split | None = None
     seed: int = 0
     shift: float = 0.0
     shift_by: ShiftKind = "size"
-    world: Literal["rooms", "apartments", "houses"] | None = None
+    world: WorldName | None = None
 
     @functools.cached_property
     def world_name(self) -> str:

@@ -190,8 +190,8 @@ def test_more_lines_than_styles_can_be_told_apart():
     curve_by_estimator = {f"estimator {index}": make_curve(0.5, 0.6, 0.7) for index in range(9)}
     (axes,) = figures.auc_figure(curve_by_estimator).axes
     lines = [line for line in axes.get_lines() if line.get_marker() != "None"]
-    looks = {(line.get_color(), line.get_marker(), line.get_markerfacecolor()) for line in lines}
-    assert len(lines) == len(looks) == 9
+    line_styles = {(line.get_color(), line.get_marker(), line.get_markerfacecolor()) for line in lines}
+    assert len(lines) == len(line_styles) == 9
 
     # Every shift has a line in the sweep, too.
     sweeps: dict[tuple[float, Form], dict[float, dict[str, Interval]]] = {}

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+from jaxnav.choices import Split
 from jaxnav.errors import InputError
 from jaxnav.scenes.categories import category_ids, count_unknown_types
 from jaxnav.scenes.files.account import IN_REFUSED_SCENE, ImportCount
@@ -27,7 +28,6 @@ from jaxnav.scenes.worlds import WORLDS, world_name_of_origin
 from jaxnav.store.files import expand_home
 
 SceneFormat = Literal["procthor", "ai2thor", "scene-data", "habitat", "replacements", "scenes"]
-SceneSplit = Literal["train", "val", "test"]
 ImportStream = Iterator[Scene | InputError | ImportNote | ImportCount]
 
 #: Format that each option of `read_source` is for.
@@ -63,7 +63,7 @@ class ImportSummary(NamedTuple):
 def read_source(
     scene_format: SceneFormat,
     source: str,
-    split: SceneSplit = "train",
+    split: Split = "train",
     assets: Path | None = None,
     maps: Path | None = None,
     from_controller: bool = False,
@@ -175,7 +175,7 @@ def import_scenes(
     scenes: Iterable[Scene | InputError | ImportNote | ImportCount],
     source: str,
     out: Path,
-    split: SceneSplit = "train",
+    split: Split = "train",
     val: tuple[str, ...] = (),
     test: tuple[str, ...] = (),
     categories: tuple[str, ...] | None = None,
