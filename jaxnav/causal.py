@@ -158,6 +158,30 @@ def remove_from_sum(
     return jnp.where(s == 1, direct, scores)
 
 
+def remove_experience(
+    logits: jax.Array,
+    counterfactual: jax.Array,
+    gap: jax.Array,
+    epsilon: jax.Array | float,
+    form: Form,
+    *,
+    has_additive_scores: bool = False,
+) -> jax.Array:
+    """Equation 2 for any policy: `stde`, or `remove_from_sum` where the logits are a sum.
+
+    Args:
+      logits, counterfactual, gap, epsilon, form: as in `stde`.
+      has_additive_scores: whether the logits are the counterfactual ones plus direct scores, without rounding. The form
+        `residual` is no removal from a sum, and stays that of `stde`.
+
+    Returns:
+      float [..., A].
+    """
+    if has_additive_scores and form != "residual":
+        return remove_from_sum(tde(logits, counterfactual), counterfactual, gap, epsilon, form)
+    return stde(logits, counterfactual, gap, epsilon, form)
+
+
 def _log_mixture(log_a: jax.Array, log_b: jax.Array, weight_b: jax.Array) -> jax.Array:
     """log[(1 - weight_b) a + weight_b b] from the logarithms of a and b, with weight_b in [0, 1]."""
     return jnp.logaddexp(jnp.log1p(-weight_b) + log_a, jnp.log(weight_b) + log_b)

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import chex
 import hypothesis.extra.numpy as hnp
 import hypothesis.strategies as st
 import jax
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from jaxnav.causal import do, removal_weight, remove_from_sum, stde, tde
+from jaxnav.causal import do, removal_weight, remove_experience, remove_from_sum, stde, tde
 
 FORMS = ("paper", "residual", "switch", "mixture")
 SOFT = FORMS[:2]
@@ -209,3 +210,19 @@ def test_complete_removal_from_a_sum_leaves_the_direct_scores_and_epsilon_one_le
 def test_removal_from_a_sum_refuses_the_residual_form():
     with pytest.raises(ValueError, match=r"residual.*paper, switch or mixture"):
         remove_from_sum(jnp.zeros(1), jnp.zeros(1), jnp.float32(0), 0.5, "residual")
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_removal_of_a_policy_is_exact_where_its_logits_are_a_sum(form):
+    """With s = 1 the direct scores remain bit for bit; `residual` is no removal from a sum."""
+    direct, experience = jax.random.normal(jax.random.key(5), (2, 7, 6))
+    direct, experience = (jnp.round(scores * 2**12) / 2**12 for scores in (direct, experience))  # sums without rounding
+    gap = jnp.ones(7)
+    logits = direct + experience
+    removed = remove_experience(logits, experience, gap, 0.0, form, has_additive_scores=True)
+    if form == "residual":
+        chex.assert_trees_all_equal(removed, stde(logits, experience, gap, 0.0, form))
+    else:
+        chex.assert_trees_all_equal(removed, direct)
+    of_other_policy = remove_experience(logits, experience, gap, 0.5, form)
+    chex.assert_trees_all_equal(of_other_policy, stde(logits, experience, gap, 0.5, form))

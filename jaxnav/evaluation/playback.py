@@ -16,8 +16,10 @@ from jaxnav.evaluation.removal import InferenceConfig, InferenceTrace
 from jaxnav.evaluation.replacements import DecisionContext
 from jaxnav.numerics.trees import tree_where
 from jaxnav.policies.agent_loop import Agent, AgentLoop, policy_memory
-from jaxnav.policies.method import Knowledge
+from jaxnav.policies.method import Knowledge, Percept
 from jaxnav.policies.network import Params
+from jaxnav.policies.pathways import NO_ACTION
+from jaxnav.scenes.task import Rules
 
 
 class EpisodeTrace(NamedTuple):
@@ -39,6 +41,32 @@ class EpisodeTrace(NamedTuple):
     def gap(self) -> np.ndarray:
         """Layout gap D, float32 [T]."""
         return np.asarray(self.inferred.gap)
+
+
+def make_percepts(trace: EpisodeTrace, rows: np.ndarray, rules: Rules, goal: int) -> Percept:
+    """Make the inputs of a tracker in an episode.
+
+    Args:
+      trace: episode of T steps.
+      rows: uint8 [T, N], observation rows of its poses.
+      rules: rules of the task.
+      goal: index of the category that was sought.
+
+    Returns:
+      Leaves [T, ...].
+    """
+    cell, heading, horizon = rules.split_pose(trace.pose)
+    # A percept holds the previous action; the first percept has none.
+    has_moved = np.concatenate([[False], np.diff(cell) != 0])
+    earlier_actions = jnp.asarray(trace.action[:-1], jnp.int32)
+    return Percept(
+        row=jnp.asarray(rows),
+        heading=jnp.asarray(heading),
+        action=jnp.concatenate([jnp.array([NO_ACTION], jnp.int32), earlier_actions]),
+        moved=jnp.asarray(has_moved),
+        horizon=jnp.asarray(horizon),
+        goal=jnp.full(len(heading), goal, jnp.int32),
+    )
 
 
 class _Step(NamedTuple):

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxnav.causal import FORMS, do, removal_weight, remove_from_sum, stde, tde
+from jaxnav.causal import FORMS, do, removal_weight, remove_experience, tde
 from jaxnav.choices import Form
 from jaxnav.evaluation.replacements import other_running_episode
 from jaxnav.policies.handover import Decider
@@ -237,10 +237,10 @@ def apply_removal(
     # The form is a traced index. Entries run one by one, so `switch` computes the selected form alone.
     def remove_softly(form: Form) -> tuple[jax.Array, jax.Array]:
         weight = removal_weight(gap, config.epsilon, form)
-        if has_additive_scores and form != "residual":
-            direct = tde(logits, removed_logits)
-            return remove_from_sum(direct, removed_logits, gap, config.epsilon, form), weight
-        return stde(logits, removed_logits, gap, config.epsilon, form), weight
+        soft_logits = remove_experience(
+            logits, removed_logits, gap, config.epsilon, form, has_additive_scores=has_additive_scores
+        )
+        return soft_logits, weight
 
     branches = [functools.partial(remove_softly, form) for form in FORMS]
     soft_logits, soft_weight = jax.lax.switch(config.form, branches)

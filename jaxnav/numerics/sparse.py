@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxnav.numerics.trees import tree_where
+from jaxnav.numerics.trees import take_rows, tree_where
 
 #: Number of parts of a batch, which are computed one after the other or skipped.
 _NUM_PARTS = 8
@@ -53,7 +53,7 @@ def _update(function: Function, shared: Any, mask: jax.Array, inputs: Any, state
 
     def update_part(index: jax.Array, state: Any) -> Any:
         # A part may end with members that are not masked, which keep their state.
-        members = _take_rows((mask, inputs, state), index)
+        members = take_rows((mask, inputs, state), index)
         return _set_rows(state, index, _update_members(function, shared, *members))
 
     return _for_each_part(mask, update_part, state)
@@ -76,7 +76,7 @@ def _update_backward(function: Function, residuals: Any, output_grad: Any) -> tu
 
     def differentiate_part(index: jax.Array, grads: Any) -> Any:
         shared_grad, inputs_grad, state_grad = grads
-        members = _take_rows((mask, float_inputs, other_inputs, state), index)
+        members = take_rows((mask, float_inputs, other_inputs, state), index)
         part_mask, part_floats, part_others, part_state = members
 
         def recompute(shared: Any, part_floats: Any, part_state: Any) -> Any:
@@ -85,7 +85,7 @@ def _update_backward(function: Function, residuals: Any, output_grad: Any) -> tu
 
         # Shared gradients add up over the parts; members have rows of their own.
         _, part_vjp = jax.vjp(recompute, shared, part_floats, part_state)
-        part_shared_grad, *member_grads = part_vjp(_take_rows(state_grad, index))
+        part_shared_grad, *member_grads = part_vjp(take_rows(state_grad, index))
         shared_grad = jax.tree.map(jnp.add, shared_grad, part_shared_grad)
         return shared_grad, *_set_rows((inputs_grad, state_grad), index, tuple(member_grads))
 
@@ -130,10 +130,6 @@ def _join_floats(tree: Any, floats: Any, others: Any) -> Any:
 
 def _is_float(leaf: jax.Array) -> bool:
     return jnp.issubdtype(leaf.dtype, jnp.floating)
-
-
-def _take_rows(tree: Any, index: jax.Array) -> Any:
-    return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
 def _set_rows(tree: Any, index: jax.Array, rows: Any) -> Any:

@@ -11,15 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.causal import remove_from_sum
-from jaxnav.evaluation.playback import EpisodeTrace
-from jaxnav.policies.method import Percept
+from jaxnav.evaluation.playback import EpisodeTrace, make_percepts
 from jaxnav.policies.methods.belief import TargetPolicy
 from jaxnav.policies.methods.belief_map import read_squares
 from jaxnav.policies.methods.local_policy import LocalPolicy
 from jaxnav.policies.methods.map_tracker import SQUARE_CELLS, SearchState
 from jaxnav.policies.network import Params, bind
-from jaxnav.policies.pathways import NO_ACTION
 from jaxnav.runs.policies import Policies
 from jaxnav.scenes.scene import CELL_SIZE, Scene, scene_extent
 from jaxnav.scenes.tables.compile import Bank
@@ -71,7 +68,7 @@ class BeliefTracer:
         padding = -num_steps % _PADDED_STEPS
         inferred = trace.inferred
         inputs = (
-            _make_percepts(trace, bank, goal),
+            make_percepts(trace, bank.rows[trace.pose], bank.task.rules, goal),
             jnp.asarray(inferred.action_logits.argmax(axis=-1)),
             jnp.asarray(inferred.removal_weight),
             jnp.asarray(inferred.layout_weights),
@@ -96,11 +93,8 @@ class BeliefTracer:
 
         def compute_belief(state: SearchState, removal_weight: jax.Array, layout_weights: jax.Array) -> jax.Array:
             assert state.looks is not None
-            log_beliefs = policy.log_beliefs(read_squares(state.cells, state.looks), goal, layout_weights)
-            experience = log_beliefs.layout - log_beliefs.places
-            # A removal weight is a gap without a threshold.
-            gap = jnp.full(len(experience), removal_weight)
-            return jax.nn.softmax(remove_from_sum(log_beliefs.places, experience, gap, 0.0), axis=(0, 1))
+            squares = read_squares(state.cells, state.looks)
+            return policy.goal_probabilities(squares, goal, layout_weights, removal_weight)
 
         def follow_step(state: SearchState, step_inputs: Any) -> tuple[SearchState, tuple[jax.Array, jax.Array]]:
             percept, choice, removal_weight, layout_weights = step_inputs
@@ -140,20 +134,3 @@ def find_squares(scene: Scene, start: np.ndarray, num_squares: int) -> SquareGri
     num_shown = np.minimum(last_square - first_square, num_squares)
     columns, rows = (first_square[axis] + np.arange(num_shown[axis]) for axis in range(2))
     return SquareGrid(origin + SQUARE_SIZE * first_square, rows % num_squares, columns % num_squares)
-
-
-def _make_percepts(trace: EpisodeTrace, bank: Bank, goal: int) -> Percept:
-    """Return the inputs of the tracker in an episode, leaves [T, ...]."""
-    rules = bank.task.rules
-    cell, heading, horizon = rules.split_pose(trace.pose)
-    # A percept holds the previous action; the first percept has none.
-    has_moved = np.concatenate([[False], np.diff(cell) != 0])
-    earlier_actions = jnp.asarray(trace.action[:-1], jnp.int32)
-    return Percept(
-        row=jnp.asarray(bank.rows[trace.pose]),
-        heading=jnp.asarray(heading),
-        action=jnp.concatenate([jnp.array([NO_ACTION], jnp.int32), earlier_actions]),
-        moved=jnp.asarray(has_moved),
-        horizon=jnp.asarray(horizon),
-        goal=jnp.full(len(heading), goal, jnp.int32),
-    )

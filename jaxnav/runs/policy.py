@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxnav import __version__
-from jaxnav.causal import do, stde
+from jaxnav.causal import do, remove_experience
 from jaxnav.choices import EstimatorName, Form
 from jaxnav.env.objectnav import OTHER_ROOM, ObjectNav, Observation, prior_index
 from jaxnav.errors import InputError
@@ -194,7 +194,14 @@ class LoadedPolicy(struct.PyTreeNode):
         # Counterfactual decision under do(S = 0, G = 0) with the factual experience, and its removal.
         counterfactual_state = memory.policy_state.counterfactual_state()
         counterfactual = policy.decide(do(pathways, scene=0.0, goal=0.0), counterfactual_state).logits
-        logits = stde(factual, counterfactual, layout.gap, epsilon, self.estimator_config.form)
+        logits = remove_experience(
+            factual,
+            counterfactual,
+            layout.gap,
+            epsilon,
+            self.estimator_config.form,
+            has_additive_scores=policy.has_additive_scores,
+        )
         return PolicyOutput(
             logits, factual, counterfactual, layout.gap, inputs.layout_weights, perception_state, decision
         )

@@ -20,7 +20,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
-from jaxnav.causal import remove_from_sum
 from jaxnav.env.render import (
     AGENT_COLOR,
     BACKGROUND_COLOR,
@@ -28,6 +27,7 @@ from jaxnav.env.render import (
     SEEN_COLOR,
 )
 from jaxnav.errors import InputError
+from jaxnav.evaluation.playback import make_percepts
 from jaxnav.policies.method import Knowledge, Percept
 from jaxnav.policies.methods.belief import TargetPolicy
 from jaxnav.policies.methods.belief_map import read_squares
@@ -40,7 +40,6 @@ from jaxnav.policies.methods.map_tracker import (
     goal_on_map,
 )
 from jaxnav.policies.network import Params, bind
-from jaxnav.policies.pathways import NO_ACTION
 from jaxnav.scenes.scene import CELL_SIZE, scene_extent
 from jaxnav.scenes.task import LOOK_DOWN, LOOK_UP, MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT
 from jaxnav.viz.episode import PlayedEpisode, describe_step
@@ -115,8 +114,9 @@ def take_snapshot(episode: PlayedEpisode, step: int) -> SearchSnapshot:
         _, next_state = control.act(choice, tracker.update(state, knowledge, percept), knowledge)
         return next_state, None
 
+    percepts = make_percepts(episode.trace, episode.rows, episode.task.rules, episode.goal)
     choices = jnp.asarray(episode.trace.inferred.action_logits.argmax(axis=-1))
-    inputs = jax.tree.map(lambda leaf: leaf[: step + 1], (_percepts(episode), choices))
+    inputs = jax.tree.map(lambda leaf: leaf[: step + 1], (percepts, choices))
     search_state, _ = jax.jit(lambda inputs: jax.lax.scan(update_map, tracker.init(knowledge), inputs))(inputs)
 
     # Predict the next actions with the choice of this step.
@@ -154,11 +154,9 @@ def compute_beliefs(episode: PlayedEpisode, search_state: SearchState, step: int
         assert isinstance(policy, TargetPolicy)
         assert search_state.looks is not None
         squares = read_squares(search_state.cells, search_state.looks)
-        beliefs = policy.log_beliefs(squares, jnp.int32(episode.goal), layout_weights)
-        experience = beliefs.layout - beliefs.places
-        # A removal weight is a gap without a threshold.
-        remaining = remove_from_sum(beliefs.places, experience, jnp.full(len(experience), removal_weight), 0.0)
-        return jax.nn.softmax(beliefs.layout, axis=(0, 1)), jax.nn.softmax(remaining, axis=(0, 1))
+        goal = jnp.int32(episode.goal)
+        before_removal = policy.goal_probabilities(squares, goal, layout_weights)
+        return before_removal, policy.goal_probabilities(squares, goal, layout_weights, removal_weight)
 
     params = jax.tree.map(lambda leaf: leaf[0], policies.params)
     before_removal, after_removal = predict_goal(params, search_state)
@@ -192,22 +190,6 @@ def predict_path(control: LocalPolicy, search_state: SearchState, choice: jax.Ar
     first_pose = (search_state.position, search_state.heading, search_state.horizon)
     _, cells = jax.lax.scan(move, first_pose, length=MAX_PREDICTED_ACTIONS)
     return cells
-
-
-def _percepts(episode: PlayedEpisode) -> Percept:
-    """Return the inputs of the tracker in an episode, leaves [T, ...]."""
-    _, heading, horizon = episode.task.rules.split_pose(episode.trace.pose)
-    # A percept holds the previous action; the first percept has none.
-    has_moved = (np.diff(episode.places, axis=0) != 0).any(axis=1)
-    earlier_actions = jnp.asarray(episode.trace.action[:-1], jnp.int32)
-    return Percept(
-        row=jnp.asarray(episode.rows),
-        heading=jnp.asarray(heading),
-        action=jnp.concatenate([jnp.array([NO_ACTION], jnp.int32), earlier_actions]),
-        moved=jnp.asarray(np.concatenate([[False], has_moved])),
-        horizon=jnp.asarray(horizon),
-        goal=jnp.full(len(heading), episode.goal, jnp.int32),
-    )
 
 
 class MapProjection:

@@ -32,6 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+from jaxnav.causal import remove_from_sum
 from jaxnav.errors import InputError
 from jaxnav.layout import scale_weights
 from jaxnav.numerics.rounding import round_to_grid
@@ -60,6 +61,7 @@ from jaxnav.policies.methods.map_tracker import (
     SearchState,
     learned_view_table,
     nearest_looks,
+    other_category_bits,
 )
 from jaxnav.policies.methods.semexp import learn_search_setup, required_map_sizes
 from jaxnav.policies.network import Policy
@@ -221,10 +223,7 @@ class Predictor(Experience):
     ) -> tuple[Features, BeliefReading]:
         """Replace the categories on the map; floor, walls and the goal stay."""
         mixed_features, _ = super().replace_other_categories(features, reading, other_features, other_reading)
-        num_categories = features.goal.shape[-1]
-        category_bits = jnp.asarray(1 << np.arange(num_categories), jnp.uint32)
-        replaced_bits = jnp.where(features.goal > 0, jnp.uint32(0), category_bits).sum(axis=-1, dtype=jnp.uint32)
-        replaced_bits = replaced_bits[..., None, None]
+        replaced_bits = other_category_bits(features.goal)[..., None, None]
         cells = (reading.cells & ~replaced_bits) | (other_reading.cells & replaced_bits)
         return mixed_features, reading._replace(cells=cells)
 
@@ -319,6 +318,21 @@ class TargetPolicy(Policy):
         missed = missed_looks(squares.looks, self.detection_rates[...][goal], self.hidden_logit[...])
         places = self.places(squares) + missed
         return LogBeliefs(places, places + self.method.score_squares(squares, goal, weights))
+
+    def goal_probabilities(
+        self, squares: MapSquares, goal: jax.Array, weights: jax.Array, removal_weight: jax.Array | float = 0.0
+    ) -> jax.Array:
+        """Probability float32 [n, n] that the goal is in each square, after removal of a share of experience (eq. 2).
+
+        Args:
+          squares, goal, weights: as in `log_beliefs`.
+          removal_weight: float32 [], the share s.
+        """
+        beliefs = self.log_beliefs(squares, goal, weights)
+        # A removal weight is a gap without a threshold.
+        gap = jnp.full(len(beliefs.places), removal_weight)
+        remaining = remove_from_sum(beliefs.places, beliefs.layout - beliefs.places, gap, 0.0)
+        return jax.nn.softmax(remaining, axis=(0, 1))
 
     def pathways(
         self, inputs: PolicyInputs, memory: PolicyState | None = None, partner_inputs: PolicyInputs | None = None

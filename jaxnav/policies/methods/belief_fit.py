@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from jaxnav.env.objectnav import OTHER_ROOM, EnvParams
+from jaxnav.layout import LayoutEstimator
 from jaxnav.policies.agent_loop import AgentLoop, policy_memory
 from jaxnav.policies.method import Knowledge
 from jaxnav.policies.methods.belief_map import MapSquares, read_squares
@@ -34,7 +36,6 @@ from jaxnav.scenes.tables.compile import Bank
 from jaxnav.scenes.tables.observation_row import RowFormat, relative_position
 
 if TYPE_CHECKING:
-    from jaxnav.env.objectnav import EnvParams
     from jaxnav.policies.methods.belief import TargetPolicy
 
 #: Smallest number of actions between two snapshots of a map, and largest number of snapshots, which bounds the memory.
@@ -107,7 +108,7 @@ class LookCounts(NamedTuple):
 def fit_belief(
     agent_loop: AgentLoop,
     bank: Bank,
-    env_params: "EnvParams",
+    env_params: EnvParams,
     knowledge: Knowledge,
     key: jax.Array,
     num_searches: int,
@@ -125,12 +126,11 @@ def fit_belief(
     )
     params = params | {"detection_rates": detection_rates(look_counts)}
 
-    # Goals of the task, and the layout's weights before the first view.
-    goals = np.flatnonzero(agent_loop.env.task.is_goal())
-    prior = knowledge.layout[-1]
-    prior_share = prior / prior.sum(axis=-1, keepdims=True)
-    goal_weights = (prior_share + jnp.eye(len(prior))).T[goals]
-    return fit_weights(agent_loop, params, snapshots, jnp.asarray(goals), goal_weights, key)
+    # Goals of the task, and the layout's weights before the first view. Homes have rooms of all types, and one prior.
+    goals = jnp.asarray(np.flatnonzero(agent_loop.env.task.is_goal()))
+    estimator = LayoutEstimator(knowledge.layout[OTHER_ROOM])
+    goal_weights = jax.vmap(estimator.goal_weights, (None, 0))(estimator.init(), goals)
+    return fit_weights(agent_loop, params, snapshots, goals, goal_weights, key)
 
 
 def locate_objects(bank: Bank) -> HomeObjects:
@@ -177,7 +177,7 @@ def explore_homes(
     agent_loop: AgentLoop,
     params: Params,
     home_objects: HomeObjects,
-    env_params: "EnvParams",
+    env_params: EnvParams,
     knowledge: Knowledge,
     key: jax.Array,
     num_searches: int,

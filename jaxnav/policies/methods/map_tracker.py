@@ -208,6 +208,12 @@ def category_bit(category: jax.Array) -> jax.Array:
     return jnp.uint32(1) << category.astype(jnp.uint32)
 
 
+def other_category_bits(goal: jax.Array) -> jax.Array:
+    """Return the bits of all categories but the goal, uint32 [...], for a goal float32 [..., K], one-hot."""
+    category_bits = jnp.asarray(1 << np.arange(goal.shape[-1]), jnp.uint32)
+    return jnp.where(goal > 0, NO_BITS, category_bits).sum(axis=-1, dtype=jnp.uint32)
+
+
 @functools.lru_cache
 def make_view_table(rules: Rules, view: int) -> ViewTable:
     """Return the cells of a view of V x V cells, by heading."""

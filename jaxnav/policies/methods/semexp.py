@@ -35,6 +35,7 @@ from jaxnav.policies.methods.map_tracker import (
     WALL_BIT,
     MapReading,
     MapTracker,
+    other_category_bits,
 )
 from jaxnav.policies.methods.tpn import learn_motion
 from jaxnav.policies.spec import PolicySpec
@@ -81,12 +82,7 @@ class MappedCategories(Experience):
         """Replace the categories in each block; floor, walls and the goal stay."""
         mixed_features, _ = super().replace_other_categories(features, reading, other_features, other_reading)
 
-        # The bits of all categories but the goal, uint32 [..., 1].
-        num_categories = features.goal.shape[-1]
-        category_bits = jnp.asarray(1 << np.arange(num_categories), jnp.uint32)
-        replaced_bits = jnp.where(features.goal > 0, jnp.uint32(0), category_bits).sum(
-            axis=-1, keepdims=True, dtype=jnp.uint32
-        )
+        replaced_bits = other_category_bits(features.goal)[..., None]
         blocks = (reading.blocks & ~replaced_bits) | (other_reading.blocks & replaced_bits)
         return mixed_features, reading._replace(blocks=blocks)
 
