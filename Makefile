@@ -26,7 +26,7 @@ help:
 	@echo 'make regression  train every method for a short time, and fail where success leaves its stored band'
 	@echo 'make versions   the fast tests on every Python, with the oldest and the newest packages'
 	@echo 'make docs       build the documentation, site/index.html'
-	@echo 'make bench      run every benchmark, and update results/performance and the tables of the documentation'
+	@echo 'make bench      run the benchmarks of speed, and update results/performance and the tables of the documentation'
 	@echo 'make bench-gpu  the benchmarks of docs/gpu.md on a GPU, into results/performance/gpu'
 	@echo 'make package    build the wheel and the source archive in dist/, and try the wheel in a new environment'
 	@echo 'make release    make package for a committed version with a changelog; uploads and tags nothing'

@@ -96,7 +96,7 @@ class GameResult(NamedTuple):
 
     Attributes:
       poses: int [T + 1], indices of the poses in the bank, from the start on.
-      ending: `found in`, `out of time after` or `wrong Done after`, which the number of actions follows.
+      ending: `found in`, `wrong Done after`, `out of time after` or `left after`, which the number of actions follows.
     """
 
     poses: list[int]

@@ -1,4 +1,4 @@
-"""Layout shift: categories of similar size exchange their places.
+"""Layout shift: categories exchange their places, those of similar size or by a fitted exchange.
 
 `exchange_places` is a dial for how much of the learned layout is wrong in a scene, from 0 (none) to 1 (all categories).
 """
@@ -25,7 +25,7 @@ Cycle = Sequence[int]
 def exchange_places(
     scene: Scene, task: Task, shift: float, seed: int, context_exchange: ContextExchange | None = None
 ) -> Scene:
-    """Exchange the places of categories of similar size.
+    """Exchange the places of categories: of similar size, or by a fitted context exchange.
 
     With `context_exchange`, the first `shift` of its cycles for the scene's room type, rounded, and at least one,
     exchange. They are equal in all scenes of a room type; absent categories leave their cycle.

@@ -34,6 +34,13 @@ MIN_RANGE = 1.5
 MAX_RANGE = 5.0
 #: Size of the objects that false alarms report, metres.
 FALSE_ALARM_SIZE = 0.3
+# Confidence of a detection: loss at the end of the range, width of its noise; least value and width of false alarms.
+_CONFIDENCE_LOSS = 0.5
+_CONFIDENCE_NOISE = 0.2
+_MIN_ALARM_CONFIDENCE = 0.3
+_ALARM_CONFIDENCE_RANGE = 0.3
+# Nearer objects look no larger, metres.
+_MIN_DISTANCE = 0.25
 #: Apparent size of an object at the end of its detection range: about 15 pixels of a 300 x 300 picture with a field of
 #: view of 100 degrees.
 MIN_APPARENT_SIZE = 0.12
@@ -217,23 +224,25 @@ class Detector:
         error_draw, noise, range_draw, bearing_draw = rng.random((4, *visible.shape), dtype=np.float32)
 
         # Misses become more likely with distance; false alarms only occur without a visible object.
-        nearness = _relative_distance(distance, size)
-        is_missed = error_draw < self._miss_probability(nearness)
-        false_alarm = ~visible & (error_draw < self.false_alarm)
+        relative_distance = _relative_distance(distance, size)
+        is_missed = error_draw < self._miss_probability(relative_distance)
+        is_false_alarm = ~visible & (error_draw < self.false_alarm)
         has_errors = self.miss_near > 0 or self.miss_far > 0 or self.false_alarm > 0
-        confidence = 1.0 - 0.5 * nearness + (0.2 * (noise - 0.5) if has_errors else 0.0)
-        confidence = np.where(false_alarm, 0.3 + 0.3 * noise, confidence)
+        confidence = (
+            1.0 - _CONFIDENCE_LOSS * relative_distance + (_CONFIDENCE_NOISE * (noise - 0.5) if has_errors else 0.0)
+        )
+        confidence = np.where(is_false_alarm, _MIN_ALARM_CONFIDENCE + _ALARM_CONFIDENCE_RANGE * noise, confidence)
 
         # A false alarm lies uniformly in the part of the view cone where an object of its size could be detected.
         alarm_distance = detection_range(FALSE_ALARM_SIZE) * np.sqrt(range_draw)
         alarm_angle = np.arctan(half_view_tangent) * (2.0 * bearing_draw - 1.0)
-        ahead = np.where(false_alarm, alarm_distance * np.cos(alarm_angle), ahead)
-        right = np.where(false_alarm, alarm_distance * np.sin(alarm_angle), right)
-        size = np.where(false_alarm, FALSE_ALARM_SIZE, size)
-        apparent_size = size / np.maximum(np.hypot(ahead, right), 0.25)
+        ahead = np.where(is_false_alarm, alarm_distance * np.cos(alarm_angle), ahead)
+        right = np.where(is_false_alarm, alarm_distance * np.sin(alarm_angle), right)
+        size = np.where(is_false_alarm, FALSE_ALARM_SIZE, size)
+        apparent_size = size / np.maximum(np.hypot(ahead, right), _MIN_DISTANCE)
 
         # Bytes are 0 for undetected categories.
-        is_detected = (visible & ~is_missed) | false_alarm
+        is_detected = (visible & ~is_missed) | is_false_alarm
         detection_bytes = _scale_to_bytes(confidence, ahead, right, apparent_size)
         return np.where(is_detected[..., None], detection_bytes, 0.0).astype(np.uint8)
 
@@ -270,9 +279,9 @@ class Detector:
         np.add.at(counts, (pose[is_counted], category[is_counted]), 1)
         return np.where(is_detected, np.minimum(counts, 255), 0).astype(np.uint8)
 
-    def _miss_probability(self, nearness: np.ndarray) -> np.ndarray:
+    def _miss_probability(self, relative_distance: np.ndarray) -> np.ndarray:
         """Return the probability of missing an object at a distance relative to its detection range."""
-        return self.miss_near + (self.miss_far - self.miss_near) * nearness**2
+        return self.miss_near + (self.miss_far - self.miss_near) * relative_distance**2
 
 
 #: A detector without errors.
