@@ -84,7 +84,8 @@ def build_environment(
       default_limit: step limit of all other room types.
       num_cells: least number of cells; a smaller bank is padded with unreachable cells, so that banks of equal sizes
         share one compilation.
-      num_scenes: least number of scenes; a smaller bank repeats its scenes from the first.
+      num_scenes: least number of scenes; a smaller bank repeats its scenes from the first, but episodes start in the
+        bank's own scenes alone.
       shaping: see `ObjectNav`.
       with_expert: includes the actions of shortest paths, for imitation and guidance.
 
@@ -116,6 +117,7 @@ def build_environment(
         goals=jnp.asarray(bank.goals[scene_indices]),
         num_goals=jnp.asarray(bank.num_goals[scene_indices]),
         expert=pad_cells(bank.expert, poses_per_cell) if with_expert else None,
+        num_scenes=jnp.int32(len(bank.names)) if num_scenes else None,
     )
 
     # Layout prior and step limit follow from the room type, [S] each.

@@ -59,6 +59,7 @@ class SceneTables(struct.PyTreeNode):
       num_goals: int32 [S], number of possible goals of each scene.
       expert: uint8 [P, K], first action of a shortest path to each goal; None unless training imitates it or guides
         by it.
+      num_scenes: int32 [], number of scenes before padding repeats them; None for S.
     """
 
     ahead: jax.Array
@@ -70,6 +71,7 @@ class SceneTables(struct.PyTreeNode):
     goals: jax.Array
     num_goals: jax.Array
     expert: jax.Array | None = None
+    num_scenes: jax.Array | None = None
 
 
 class EnvParams(struct.PyTreeNode):
@@ -149,8 +151,9 @@ class ObjectNav:
     def reset(self, key: jax.Array, params: EnvParams) -> tuple[Observation, State]:
         """Start an episode.
 
-        The scene, the goal among those possible in the scene, the cell and the heading are drawn uniformly; the camera
-        looks straight ahead.
+        The scene, the goal among those possible in the scene, the cell and the heading are drawn uniformly, but for a
+        share `near_starts` of the episodes, which start in the nearest of several random cells. The camera looks straight
+        ahead.
 
         Args:
           key: PRNG key, consumed.
@@ -170,7 +173,7 @@ class ObjectNav:
         random_words = _random_words(key, num_words)
 
         # Scene, goal, cell and heading.
-        num_scenes = tables.num_goals.shape[0]
+        num_scenes = tables.num_goals.shape[0] if tables.num_scenes is None else tables.num_scenes
         scene = _uniform_below(random_words[0], num_scenes)
         goal = tables.goals[scene, _uniform_below(random_words[1], tables.num_goals[scene])]
         cell = tables.first_cell[scene] + _uniform_below(random_words[2], tables.num_cells[scene])

@@ -208,6 +208,14 @@ def test_build_environment_never_cuts_tables_off():
     assert (len(params.tables.ahead), len(params.room)) == (num_cells, 4)
 
 
+@pytest.mark.parametrize("num_scenes", [0, 6])
+def test_scenes_are_equally_likely_in_a_padded_bank_too(num_scenes):
+    """The bank has four scenes; padded to six it repeats the first two, which would be drawn twice as often."""
+    env, params = build_environment(BANK, {}, 9, num_scenes=num_scenes)
+    states = start_episodes(env, params, 4000)
+    assert chisquare(np.bincount(states.scene, minlength=4)).pvalue > 0.001
+
+
 @pytest.mark.parametrize("share", [0.25, 1.0])
 def test_near_starts_take_the_nearest_of_several_candidates(share):
     """Of C cells the nearest: its distance is at most x with probability 1 - (1 - F(x))^C, F that of one cell."""
