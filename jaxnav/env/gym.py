@@ -7,6 +7,7 @@ The worlds `apartments` and `houses` are registered likewise; keyword arguments 
 Importing this module registers the ids.
 """
 
+import functools
 import os
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple, cast
@@ -267,37 +268,39 @@ class _BatchedEnv:
 
     def __init__(self, env: ObjectNav, params: EnvParams) -> None:
         self._env = env
-        self._params = params
-        self.reset = jax.jit(jax.vmap(self._reset))
-        self.advance = jax.jit(jax.vmap(self._advance))
-        self.step = jax.jit(jax.vmap(self._step))
+        # The tables are an argument of the compiled programs, or each would hold a copy of them.
+        self.reset = functools.partial(jax.jit(jax.vmap(self._reset, (None, 0))), params)
+        self.advance = functools.partial(jax.jit(jax.vmap(self._advance, (None, 0, 0))), params)
+        self.step = functools.partial(jax.jit(jax.vmap(self._step, (None, 0, 0, 0))), params)
 
-    def _reset(self, key: jax.Array) -> tuple[EpisodeState, NamedValues]:
-        _, start_state = self._env.reset(key, self._params)
+    def _reset(self, params: EnvParams, key: jax.Array) -> tuple[EpisodeState, NamedValues]:
+        _, start_state = self._env.reset(key, params)
         episode = EpisodeState(start_state, jnp.bool_(False))
-        return episode, self._observe(episode)
+        return episode, self._observe(params, episode)
 
-    def _advance(self, episode: EpisodeState, action: jax.Array) -> tuple[EpisodeState, NamedValues, StepSignals]:
-        next_state, reward, terminated, truncated = self._env.advance(episode.state, action, self._params)
+    def _advance(
+        self, params: EnvParams, episode: EpisodeState, action: jax.Array
+    ) -> tuple[EpisodeState, NamedValues, StepSignals]:
+        next_state, reward, terminated, truncated = self._env.advance(episode.state, action, params)
 
         # A rotation or a blocked MoveAhead keeps the cell.
         moved = self._env.cell_of_pose(next_state.pose) != self._env.cell_of_pose(episode.state.pose)
-        success = terminated & self._env.done_succeeds(next_state, self._params)
+        success = terminated & self._env.done_succeeds(next_state, params)
         next_episode = EpisodeState(next_state, moved)
-        return next_episode, self._observe(next_episode), StepSignals(reward, terminated, truncated, success)
+        return next_episode, self._observe(params, next_episode), StepSignals(reward, terminated, truncated, success)
 
     def _step(
-        self, key: jax.Array, episode: EpisodeState, action: jax.Array
+        self, params: EnvParams, key: jax.Array, episode: EpisodeState, action: jax.Array
     ) -> tuple[EpisodeState, NamedValues, NamedValues, StepSignals]:
-        final_episode, final_observation, signals = self._advance(episode, action)
+        final_episode, final_observation, signals = self._advance(params, episode, action)
 
         # Replace an episode that has ended by a new one, which is drawn in any case.
         has_ended = signals.terminated | signals.truncated
-        episode, observation = tree_where(has_ended, self._reset(key), (final_episode, final_observation))
+        episode, observation = tree_where(has_ended, self._reset(params, key), (final_episode, final_observation))
         return episode, observation, final_observation, signals
 
-    def _observe(self, episode: EpisodeState) -> NamedValues:
-        return name_observation(self._env, self._params, episode.state, episode.moved)
+    def _observe(self, params: EnvParams, episode: EpisodeState) -> NamedValues:
+        return name_observation(self._env, params, episode.state, episode.moved)
 
 
 def _validate_actions(space: spaces.Space, episodes: EpisodeState | None, action: Any) -> np.ndarray:

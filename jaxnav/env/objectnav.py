@@ -152,8 +152,8 @@ class ObjectNav:
         """Start an episode.
 
         The scene, the goal among those possible in the scene, the cell and the heading are drawn uniformly, but for a
-        share `near_starts` of the episodes, which start in the nearest of several random cells. The camera looks straight
-        ahead.
+        share `near_starts` of the episodes, which start in the nearest of several random cells. The camera looks
+        straight ahead.
 
         Args:
           key: PRNG key, consumed.
