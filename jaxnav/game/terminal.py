@@ -17,7 +17,7 @@ from jaxnav.baselines.shortest_path import oracle_actions
 from jaxnav.env.render import GOAL_CHARACTER, goal_cells, plan_characters
 from jaxnav.errors import InputError
 from jaxnav.game.session import Game, GameResult, GameView
-from jaxnav.runs.evaluate import find_scene
+from jaxnav.runs.evaluate import find_scenes
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import CELL_SIZE
 from jaxnav.scenes.tables.observation_row import VIEW_BLOCKED, VIEW_FREE, RowFormat, relative_position
@@ -209,7 +209,8 @@ def result_screen(game: Game, result: GameResult, columns: int) -> RenderableTyp
 def _map_text(game: Game, poses: list[int], shortest_poses: list[int], columns: int) -> Text:
     """Return the map of the scene with both paths; +z is up."""
     scene_index = int(game.episode.scene[0])
-    scene = find_scene(game.world, game.bank.names[scene_index])
+    scene_name = game.bank.names[scene_index]
+    scene = find_scenes(game.world, [scene_name])[scene_name]
 
     # Walls, standable cells and furniture, [nz, nx]. Characters are about twice as high as wide: spaces keep the
     # proportions where they fit.

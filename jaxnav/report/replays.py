@@ -25,7 +25,7 @@ from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.playback import EpisodeTrace
 from jaxnav.evaluation.variants import EvaluationRow
 from jaxnav.report.beliefs import SQUARE_SIZE, BeliefTracer, find_squares
-from jaxnav.runs.evaluate import find_scene, replay_episodes
+from jaxnav.runs.evaluate import find_scenes, replay_episodes
 from jaxnav.runs.policies import Policies
 from jaxnav.runs.worlds import CompiledWorld
 from jaxnav.scenes.categories import category_ids
@@ -301,8 +301,12 @@ def make_replays(
     scene_plans: list[ScenePlan] = []
     plan_index: dict[tuple[int, int], int] = {}
     poses_by_plan = []
+    scene_by_plan: list[Scene] = []
     for layout, layout_world in enumerate(layout_worlds):
-        for scene in np.unique(selected_episodes.scene).tolist():
+        layout_bank = layout_world.banks[0]
+        scene_indices = np.unique(selected_episodes.scene).tolist()
+        scene_by_name = find_scenes(layout_world, [layout_bank.names[scene] for scene in scene_indices])
+        for scene in scene_indices:
             visited_poses = []
             for player_layout, traces in zip(layout_of_player, traces_by_agent, strict=True):
                 if player_layout == layout:
@@ -311,8 +315,8 @@ def make_replays(
             poses = np.unique(np.concatenate(visited_poses))
             plan_index[layout, scene] = len(scene_plans)
             poses_by_plan.append(poses)
-            plan_scene = find_scene(layout_world, layout_world.banks[0].names[scene])
-            scene_plans.append(make_plan(plan_scene, layout_world.banks[0], scene, poses))
+            scene_by_plan.append(scene_by_name[layout_bank.names[scene]])
+            scene_plans.append(make_plan(scene_by_plan[-1], layout_bank, scene, poses))
 
     # One trace for each episode and agent.
     replay_episode_list = []
@@ -325,7 +329,8 @@ def make_replays(
             trace = traces[episode_index]
             course = _make_trace(trace, plan, poses_by_plan[plan], has_layout=row.arm == "layout")
             if tracer is not None:
-                frames = _make_belief_frames(tracer, trace, layout_worlds[layout], scene, goal)
+                layout_bank = layout_worlds[layout].banks[0]
+                frames = _make_belief_frames(tracer, trace, layout_bank, scene, scene_by_plan[plan], goal)
                 course = dataclasses.replace(course, belief=frames)
             courses.append(course)
         best_length = int(selected_episodes.best_length[episode_index])
@@ -366,14 +371,12 @@ def _make_tracers(agents: Sequence[ReplayAgent]) -> list[BeliefTracer | None]:
 
 
 def _make_belief_frames(
-    tracer: BeliefTracer, trace: EpisodeTrace, world: CompiledWorld, scene_index: int, goal: int
+    tracer: BeliefTracer, trace: EpisodeTrace, bank: Bank, scene_index: int, scene: Scene, goal: int
 ) -> BeliefFrames:
     """Return the beliefs of an episode as data of the page."""
-    bank = world.banks[0]
     steps, beliefs = tracer.compute(trace, bank, goal)
 
     # Squares that cover the home; the map begins at the start of the episode.
-    scene = find_scene(world, bank.names[scene_index])
     first_cell, _, _ = bank.task.rules.split_pose(int(trace.pose[0]))
     start = cell_centres(scene, standable_cells(scene.reach))[first_cell - bank.first_cell[scene_index]]
     grid = find_squares(scene, start, beliefs.shape[-1])

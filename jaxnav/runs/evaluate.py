@@ -6,7 +6,7 @@ epsilons and all seeds in one compiled call, and `sweep_shifts` does so at sever
 compares results with those of layout-blind agents, and `replay_episodes` plays episodes step by step.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -774,10 +774,23 @@ def replay_episodes(
     )
 
 
-def find_scene(world: CompiledWorld, name: str) -> Scene:
-    """Scene of a world by its name."""
+def find_scenes(world: CompiledWorld, names: Collection[str]) -> dict[str, Scene]:
+    """Find scenes of a world by their names.
+
+    The scenes are read once, in order, because generated ones are generated anew at each access.
+
+    Raises:
+      LookupError: the world has no scene of a name.
+    """
+    missing_names = set(names)
+    scene_by_name: dict[str, Scene] = {}
     for index in range(len(world.scenes)):
+        if not missing_names:
+            break
         scene = world.scenes[index]
-        if scene.name == name:
-            return scene
-    raise LookupError(f"the world has no scene {name!r}")
+        if scene.name in missing_names:
+            scene_by_name[scene.name] = scene
+            missing_names.remove(scene.name)
+    if missing_names:
+        raise LookupError(f"the world has no scene {min(missing_names)!r}")
+    return scene_by_name

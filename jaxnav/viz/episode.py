@@ -33,7 +33,7 @@ from jaxnav.plain_console import PlainConsole, to_plain_console
 from jaxnav.policies.methods import method_label
 from jaxnav.progress import show_activity
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.evaluate import find_scene, replay_episodes
+from jaxnav.runs.evaluate import find_scenes, replay_episodes
 from jaxnav.runs.policies import Policies, is_policy, load_policies, load_policy_as_run
 from jaxnav.runs.run import load_run_config
 from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world, evaluation_shift
@@ -313,7 +313,8 @@ def _make_played_episode(
     bank = shifted.world.banks[0]
     episodes = shifted.episodes
     scene_index = episodes.scene[index]
-    scene = find_scene(shifted.world, bank.names[scene_index])
+    scene_name = bank.names[scene_index]
+    scene = find_scenes(shifted.world, [scene_name])[scene_name]
     visited_cells = trace.pose // bank.task.rules.poses_per_cell - bank.first_cell[scene_index]
     return PlayedEpisode(
         trace=trace,
