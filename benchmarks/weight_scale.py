@@ -34,7 +34,7 @@ import jaxnav
 from jaxnav.evaluation.replacements import (
     DecisionContext,
     ReplacedPart,
-    make_factual_decision,
+    embed_decision_inputs,
     other_running_episode,
     replace_part,
 )
@@ -116,7 +116,7 @@ def record_steps(policies: Policies, world: CompiledWorld) -> dict[str, jax.Arra
         def step(carry: tuple[Any, jax.Array], step_key: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
             agent, running = carry
             context = DecisionContext(policy, jnp.bool_(True), agent_loop, knowledge, env_params)
-            factual = make_factual_decision(agent, context)
+            factual = embed_decision_inputs(agent, context)
             inputs, memory = factual.inputs, factual.memory
             decision = policy.decide(factual.pathways, memory)
 

@@ -66,7 +66,10 @@ def tde(logits: jax.Array, counterfactual: jax.Array) -> jax.Array:
 
 
 def removal_weight(gap: jax.Array, epsilon: jax.Array | float, form: Form = "residual") -> jax.Array:
-    """Removal weight s of eq. 2: that of the removed logits, or of the decision without experience in a mixture.
+    """Removal weight s of eq. 2.
+
+    In most forms s is the weight of the removed logits; in the form `mixture` it is that of the decision without
+    experience.
 
     Args:
       gap: float32 [...], layout gap D in [0, 1].

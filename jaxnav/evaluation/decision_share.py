@@ -25,7 +25,7 @@ from jaxnav.evaluation.replacements import (
     PARTNER_PARTS,
     DecisionContext,
     ReplacedPart,
-    make_factual_decision,
+    embed_decision_inputs,
     other_running_episode,
     replace_part,
 )
@@ -100,7 +100,7 @@ def count_changes(
       Counts of 0 or 1, leaves [E] and [E, P].
     """
     policy = context.policy
-    factual = make_factual_decision(agent, context)
+    factual = embed_decision_inputs(agent, context)
     factual_logits = policy.decide(factual.pathways, factual.memory).logits
 
     def decide_with_part(part: ReplacedPart, partner: jax.Array) -> jax.Array:

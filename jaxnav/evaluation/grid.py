@@ -30,7 +30,7 @@ from jaxnav.evaluation.replacements import (
     DecisionContext,
     ReplacedPart,
     apply_selected_part,
-    make_factual_decision,
+    embed_decision_inputs,
     other_running_episode,
     replace_part,
 )
@@ -382,7 +382,7 @@ def infer_and_act(
     """
     # Factual decision; entries without the layout replace its weights by ones.
     policy, agent_loop = context.policy, context.agent_loop
-    factual = make_factual_decision(agent, context)
+    factual = embed_decision_inputs(agent, context)
     pathways, memory = factual.pathways, factual.memory
 
     # Replace a part of the decision, or of the counterfactual decision alone, by that of another episode.

@@ -4,7 +4,7 @@ How much of a decision depends on a part, such as the detections of other catego
 takes this part from another running episode at the same step and keeps the rest. The new part is a value that the
 policy meets in its own episodes; a deleted part, such as Z = 0, is not.
 
-`make_factual_decision` embeds the inputs of a decision, and `replace_part` makes the pathways and the memory of the
+`embed_decision_inputs` embeds the inputs of a decision, and `replace_part` makes the pathways and the memory of the
 decision with another part. `jaxnav.evaluation.decision_share` counts the
 decisions that change; `InferenceConfig.replaced_part` replaces a part in every step of an episode.
 """
@@ -79,7 +79,7 @@ class DecisionContext(NamedTuple):
     env_params: EnvParams
 
 
-class FactualDecision(NamedTuple):
+class DecisionInputs(NamedTuple):
     """Agents of E episodes with pathways and memory from which they decide, leaves [E, ...].
 
     Attributes:
@@ -95,16 +95,16 @@ class FactualDecision(NamedTuple):
     memory: PolicyState
 
 
-def make_factual_decision(agent: Agent, context: DecisionContext) -> FactualDecision:
+def embed_decision_inputs(agent: Agent, context: DecisionContext) -> DecisionInputs:
     """Embed the inputs of agents in E episodes."""
     inputs = context.agent_loop.policy_inputs(agent, context.knowledge, context.env_params)
     inputs = inputs._replace(layout_weights=jnp.where(context.use_layout, inputs.layout_weights, 1.0))
     memory = policy_memory(agent)
-    return FactualDecision(agent, inputs, context.policy.pathways(inputs, memory), memory)
+    return DecisionInputs(agent, inputs, context.policy.pathways(inputs, memory), memory)
 
 
 def replace_part(
-    part: ReplacedPart, partner: jax.Array, factual: FactualDecision, context: DecisionContext
+    part: ReplacedPart, partner: jax.Array, factual: DecisionInputs, context: DecisionContext
 ) -> tuple[Pathways, PolicyState]:
     """Replace one part of E decisions.
 

@@ -56,8 +56,8 @@ class HandoverPolicy:
     def pathways(self, inputs: PolicyInputs, memory: PolicyState) -> Pathways:
         """Embed the inputs of both policies; arguments as in `Policy.pathways`.
 
-        The experience is the pair of the two policies' pathways. Scene and goal are 1 [..., 1]; setting them to 0
-        removes the fallback.
+        The experience is the pair of the two policies' pathways. Scene and goal are 1 [..., 1]; a scene of 0 removes
+        the fallback, whatever the goal.
         """
         experienced_state, fallback_state = self._split_state(memory)
         # The policy with experience reads everything, the layout weights included.
@@ -69,7 +69,7 @@ class HandoverPolicy:
             plain_inputs = inputs._replace(layout_weights=jnp.ones_like(inputs.layout_weights), reading=None)
             fallback_pathways = self.fallback.pathways(plain_inputs, fallback_state)
 
-        # Scene and goal are factors on the fallback, float32 [..., 1].
+        # The scene is a factor on the fallback, float32 [..., 1].
         ones = jnp.ones_like(inputs.layout_weights[..., :1])
         both_pathways: Any = (experienced_pathways, fallback_pathways)
         return Pathways(scene=ones, goal=ones, experience=both_pathways, gate=ones)

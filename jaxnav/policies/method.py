@@ -216,7 +216,8 @@ class ActionControl:
     interval: int = 1
 
     def is_decision_step(self, state: Tree) -> None:
-        """Every choice has an effect."""
+        """Return None: every step is a decision step."""
+        return None
 
     def act(self, choice: jax.Array, state: Tree, knowledge: Any) -> tuple[jax.Array, Tree]:
         """Return the choice."""

@@ -48,7 +48,7 @@ class Pathways(NamedTuple):
       scene: float32 [..., S], the direct pathway S -> A: the surroundings without objects.
       goal: float32 [..., G], the direct pathway G -> A: detections and the goal, without experience.
       experience: float32 [..., Z], the mediator Z: what the method makes of scene and goal by experience; with streams
-        followed by a second embedding of the view.
+        followed by a second embedding of the view. In `HandoverPolicy` it is the pair of the pathways of both policies.
       gate: float32 [..., 1], factor on the logit of Done; not a pathway, so interventions do not change it.
       reading: reading of the method's tracker, for its adaptation, leaves [...]; also not a pathway.
     """

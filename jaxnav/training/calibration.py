@@ -541,20 +541,21 @@ def draw_category_exchange(key: jax.Array, present: jax.Array, frequency: jax.Ar
     return jnp.zeros_like(order).at[order].set(order[partner])
 
 
-def _fit_log_odds(pairs: jax.Array, rooms: jax.Array, is_held_out: jax.Array, num_rooms: int) -> jax.Array:
-    """Calibrated log odds that each pair indicates the shifted layout, float32 [rooms, pairs].
+def _fit_log_odds(features: jax.Array, rooms: jax.Array, is_held_out: jax.Array, num_rooms: int) -> jax.Array:
+    """Calibrated log odds that each feature indicates the shifted layout, float32 [rooms, features].
 
     The log odds are fitted to all examples, and multiplied by the scale that calibrates, in the held-out examples, a
     fit without them.
 
     Args:
-      pairs: bool [2 W, pairs], pairs seen together; the second W examples are those of the shifted layout.
+      features: bool [2 W, features], signs of each example, such as the pairs seen together; the second W examples are
+        those of the shifted layout.
       rooms: int32 [2 W], room type whose log odds hold for an example.
       is_held_out: bool [2 W], examples that only calibrate.
       num_rooms: number of room types.
     """
-    examples = pairs.astype(jnp.float32)
-    is_shifted = (jnp.arange(len(pairs)) >= len(pairs) // 2).astype(jnp.float32)
+    examples = features.astype(jnp.float32)
+    is_shifted = (jnp.arange(len(features)) >= len(features) // 2).astype(jnp.float32)
 
     def predict(log_odds: jax.Array) -> jax.Array:
         logits_by_room = examples @ log_odds.T  # [2 W, rooms]
@@ -568,7 +569,7 @@ def _fit_log_odds(pairs: jax.Array, rooms: jax.Array, is_held_out: jax.Array, nu
         def regularized_loss(log_odds: jax.Array) -> jax.Array:
             return cross_entropy(predict(log_odds), mask) + _L2_WEIGHT * (log_odds**2).sum()
 
-        return _minimize(regularized_loss, jnp.zeros((num_rooms, pairs.shape[-1])))
+        return _minimize(regularized_loss, jnp.zeros((num_rooms, features.shape[-1])))
 
     # Fit without the held-out examples, calibrate on them, then fit to all.
     held_out_logits = predict(fit(~is_held_out))

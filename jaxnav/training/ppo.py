@@ -80,10 +80,15 @@ _START_DROPOUT = 2**31 - 1
 class PPOScalars(struct.PyTreeNode):
     """Settings that may change without a new compilation, float32 [] each.
 
-    Each field but the last two holds the setting of `PPOConfig` of that name without `_weight`, `_range` or `_prob`,
-    `learning_rate` times the factor of the stage. Both guidance weights are None without guidance.
-
     Attributes:
+      learning_rate: `PPOConfig.learning_rate` times the factor of the stage.
+      gamma, gae_lambda: settings of `PPOConfig` of these names.
+      clip_range: `PPOConfig.clip`.
+      entropy_weight, final_entropy_weight: `PPOConfig.entropy` and `final_entropy`.
+      value_weight: `PPOConfig.value`.
+      distil_weight: `PPOConfig.distil`.
+      guidance_weight, final_guidance_weight: `PPOConfig.guidance` and `final_guidance`; None without guidance.
+      experience_prob: `PPOConfig.experience`.
       first_update: updates before the stage.
       num_updates: updates in the stage.
     """

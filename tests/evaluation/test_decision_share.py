@@ -13,7 +13,7 @@ from support.evaluation_steps import AGENT_LOOP, KNOWLEDGE, start_agent, take_st
 from jaxnav.evaluation.decision_share import ShareProbe, is_changed, share_interval
 from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.evaluation.grid import Evaluator, start_states
-from jaxnav.evaluation.replacements import DecisionContext, ReplacedPart, make_factual_decision, replace_part
+from jaxnav.evaluation.replacements import DecisionContext, ReplacedPart, embed_decision_inputs, replace_part
 from jaxnav.evaluation.variants import Replacement, inference_grid, replacement_grid, table_row, table_rows
 from jaxnav.policies.features import Features
 from jaxnav.policies.methods.hoz import ZoneReading, ZoneRelations
@@ -107,7 +107,7 @@ def replaced_parts_of(agent, partner, part, layout_weights=None):
     def replace(params, agent):
         policy = AGENT_LOOP.bind(params)
         context = DecisionContext(policy, jnp.bool_(True), AGENT_LOOP, KNOWLEDGE, PARAMS)
-        factual = make_factual_decision(agent, context)
+        factual = embed_decision_inputs(agent, context)
         if layout_weights is not None:
             inputs = factual.inputs._replace(layout_weights=layout_weights)
             factual = factual._replace(inputs=inputs, pathways=policy.pathways(inputs, factual.memory))
