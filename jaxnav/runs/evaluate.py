@@ -41,7 +41,7 @@ from jaxnav.evaluation.variants import (
     table_row,
     table_rows,
 )
-from jaxnav.plain_console import to_plain_console
+from jaxnav.plain_console import PlainConsole, to_plain_console
 from jaxnav.policies.methods import find_method, method_label
 from jaxnav.progress import show_activity
 from jaxnav.runs.config import RunConfig
@@ -64,7 +64,7 @@ from jaxnav.runs.share_report import (
     measure_costs,
     rows_with_shares,
 )
-from jaxnav.runs.subjects import AgentSubject, find_subject, policy_in_memory_as_run
+from jaxnav.runs.subjects import AgentSubject, PolicySubject, find_subject, policy_in_memory_as_run
 from jaxnav.runs.worlds import (
     CompiledWorld,
     compile_evaluation_world,
@@ -169,28 +169,81 @@ def evaluate(
             console=console,
         )
 
-    # A single policy has no other training seeds, so its intervals are over scenes alone.
+    # Policies with the options of the evaluation.
     config = found_subject.config
-    run = found_subject.run
-    is_run = run is not None
     policies = found_subject.policies.with_estimator(setting, hold).with_inner_steps(inner_steps)
     policies = policies.with_counterfactual_memory(counterfactual_memory)
     if "cde" in removal:
         policies.with_own_fallback()  # refuses policies that cannot act without experience
 
-    # Rows of the table: variants, thresholds and forms, with best and with sampled actions. Rows that hand over to the
-    # policy itself are run apart.
+    # Run the rows of the table: variants, thresholds and forms, with best and with sampled actions.
     default_form = "residual" if policies.estimator_config is None else policies.estimator_config.form
-    thresholds = np.asarray(epsilon, float).tolist()
-    all_rows = table_rows(thresholds, form, policies.arms, removal, default_form)
-    rows = [row for row in all_rows if not row.uses_own_fallback]
-
-    # Run all rows, and the oracle on the same episodes. The oracle reads the tables of every bank once more.
+    rows = table_rows(np.asarray(epsilon, float).tolist(), form, policies.arms, removal, default_form)
     compiled = compiled or compile_evaluation_world(config, split, scenes, shift, console, world, shift_by)
     applied_shift = evaluation_shift(config, scenes or world, shift)
-    with show_activity(console, _describe_evaluation(episodes, applied_shift)):
-        # Replacements are further rows of the same grid.
-        episode_lists = draw_episode_lists(compiled, episodes, seed)
+    table = _evaluate_table(rows, costs, policies, compiled, episodes, applied_shift, seed, console)
+    results = Results(
+        table.rows, table.outcome, table.episodes, compiled.env.categories, WORLDS[config.world].budgets, {}
+    )
+
+    # Report the table, with the settings of run and evaluation.
+    evaluation_settings = {
+        "evaluation_source": str(scenes or world or config.scene_source),
+        "evaluation_shift": applied_shift,
+        "evaluation_shift_by": shift_by,
+        "evaluation_seed": seed,
+        "evaluation_setting": setting,
+        "evaluation_hold": hold,
+        "evaluation_inner_steps": inner_steps,
+        "evaluation_counterfactual_memory": policies.spec.counterfactual_memory,
+    }
+    names = {"method": method_label(config.method), "world": compiled.scenes[0].world, "split": split}
+    report = build_report(
+        # A single policy has no other training seeds, so its intervals are over scenes alone.
+        build_result_rows(results, names, trained=found_subject.run is not None),
+        _build_differences(results, trained=found_subject.run is not None),
+        _write_notes(found_subject, policies, results, table.decision_shares),
+        table.compilations,
+        _subject_settings(found_subject, policies) | evaluation_settings,
+        table.decision_shares,
+    )
+    return results._replace(report=report)
+
+
+class _EvaluatedTable(NamedTuple):
+    """Rows of an evaluation and their results.
+
+    Attributes:
+      rows: R rows, with that of the shortest path.
+      outcome: results, leaves [R, S, E].
+      episodes: the E episodes.
+      decision_shares: entries of the report, see `build_decision_shares`.
+      compilations: number of compiled programs.
+    """
+
+    rows: list[EvaluationRow]
+    outcome: EpisodeOutcome
+    episodes: EpisodeList
+    decision_shares: list[dict[str, Any]]
+    compilations: int
+
+
+def _evaluate_table(
+    all_rows: list[EvaluationRow],
+    costs: Costs,
+    policies: Policies,
+    compiled: CompiledWorld,
+    num_episodes: int,
+    shift: float,
+    seed: int,
+    console: PlainConsole,
+) -> _EvaluatedTable:
+    """Run all rows, the replacements of parts of their decisions, and the shortest path, on the same episodes."""
+    # Rows that hand over to the policy itself are run apart.
+    rows = [row for row in all_rows if not row.uses_own_fallback]
+    with show_activity(console, _describe_evaluation(num_episodes, shift)):
+        # Replacements are further rows of the same grid. The oracle reads the tables of every bank once more.
+        episode_lists = draw_episode_lists(compiled, num_episodes, seed)
         replacements = list_cost_replacements(rows, costs)
         max_room_episodes = limit_room_episodes(episode_lists, costs)
         outcome, replaced_outcome, compilations = _evaluate_with_replacements(
@@ -206,61 +259,53 @@ def evaluate(
         rows, outcome, replacements, replaced_outcome, episode_lists, max_room_episodes
     )
     decision_shares = build_decision_shares(share_rows, share_counts, probed_episodes, costs_by_replacement)
+
     rows = [*rows, table_row("oracle", None, None, "argmax")]
     outcome = _append_row(outcome, oracle_outcome)
     if any(row.uses_own_fallback for row in all_rows):
         with show_activity(console, "evaluating removals that leave the policy without experience"):
             rows, outcome, num_compilations = _add_fallback_rows(
-                all_rows, rows, outcome, policies, compiled, episodes, seed
+                all_rows, rows, outcome, policies, compiled, num_episodes, seed
             )
         compilations += num_compilations
-    results = Results(
-        rows, outcome, join_episode_lists(episode_lists), compiled.env.categories, WORLDS[config.world].budgets, {}
-    )
+    return _EvaluatedTable(rows, outcome, join_episode_lists(episode_lists), decision_shares, compilations)
 
-    # Report: tables, notes, and the settings of run and evaluation.
-    steps_by_purpose = config.steps_by_purpose | {"exploration": policies.prior_steps}
-    names = {"method": method_label(config.method), "world": compiled.scenes[0].world, "split": split}
-    limit_notes = evaluation_notes(
-        rows,
+
+def _write_notes(
+    subject: PolicySubject, policies: Policies, results: Results, decision_shares: list[dict[str, Any]]
+) -> list[str]:
+    """Notes below the table: limits of the evaluation, decision shares, and the budget and convergence of a run."""
+    has_experience = not policies.spec.method.experience.is_empty
+    notes = evaluation_notes(
+        results.rows,
         results.metrics()["sr"],
         results.episodes,
         has_room_prior=policies.has_room_priors,
-        has_experience=not policies.spec.method.experience.is_empty,
-        is_run=is_run,
+        has_experience=has_experience,
+        is_run=subject.run is not None,
     )
-    report_notes = [
-        *limit_notes,
-        *(decision_share_notes(decision_shares) if not policies.spec.method.experience.is_empty else []),
-        *([budget_note(steps_by_purpose), *convergence_note(run.log())] if run is not None else []),
-    ]
-    if is_run:
-        subject_settings = run_settings(config) | {
-            "steps_per_policy": config.total_updates * config.steps_per_update,
-            "prior_steps": policies.prior_steps,
-            "budget": steps_by_purpose,
-        }
-    else:
-        subject_settings = {"subject": found_subject.name, "method": config.method, "world": config.world, "seeds": 1}
-    report_settings = subject_settings | {
-        "evaluation_source": str(scenes or world or config.scene_source),
-        "evaluation_shift": applied_shift,
-        "evaluation_shift_by": shift_by,
-        "evaluation_seed": seed,
-        "evaluation_setting": setting,
-        "evaluation_hold": hold,
-        "evaluation_inner_steps": inner_steps,
-        "evaluation_counterfactual_memory": policies.spec.counterfactual_memory,
+    if has_experience:
+        notes += decision_share_notes(decision_shares)
+    if subject.run is not None:
+        notes += [budget_note(_steps_by_purpose(subject.config, policies)), *convergence_note(subject.run.log())]
+    return notes
+
+
+def _subject_settings(subject: PolicySubject, policies: Policies) -> dict[str, Any]:
+    """Settings of a run with its budget, or the few that are known of a single policy."""
+    config = subject.config
+    if subject.run is None:
+        return {"subject": subject.name, "method": config.method, "world": config.world, "seeds": 1}
+    return run_settings(config) | {
+        "steps_per_policy": config.total_updates * config.steps_per_update,
+        "prior_steps": policies.prior_steps,
+        "budget": _steps_by_purpose(config, policies),
     }
-    report = build_report(
-        build_result_rows(results, names, trained=is_run),
-        _build_differences(results, trained=is_run),
-        report_notes,
-        compilations,
-        report_settings,
-        decision_shares,
-    )
-    return results._replace(report=report)
+
+
+def _steps_by_purpose(config: RunConfig, policies: Policies) -> dict[str, int]:
+    """Environment steps of a run by purpose, with those that its exploration really took."""
+    return config.steps_by_purpose | {"exploration": policies.prior_steps}
 
 
 def _refuse_policy_options(name: str, is_given: dict[str, bool]) -> None:
