@@ -10,7 +10,7 @@ packed, see `pack_shares`.
 
 import base64
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -258,14 +258,8 @@ def make_replays(
       split: split of the scenes.
       trained_layout: layout in which the agent that keeps its experience plays the episodes, too; None for none.
     """
-    world = agents[0].world
-    bank = world.banks[0]
     comparisons = pair_agents(agents)
-    players = [agent.name for agent in agents]
-    thresholds = [agent.row.epsilon for agent in agents]
     differ: list[list[int | None]] = [_count_differing_episodes(agent, agents) for agent in agents]
-    rows = [agent.row for agent in agents]
-    tracers = _make_tracers(agents)
 
     # Play the selected episodes again, because the evaluation stores results, not traces.
     main_index = _find_main_agent(agents)
@@ -275,83 +269,121 @@ def make_replays(
     if trained_layout is not None:
         selected_indices, trained_traces = _play_in_layout(agents, main_agent, trained_layout, episodes, count)
     selected_episodes = episodes.take(selected_indices)
-    traces_by_agent = []
-    for agent in agents:
-        traces_by_agent.append(replay_episodes(agent.policies, agent.world, selected_episodes, agent.row))
+    players = []
+    for agent, tracer in zip(agents, _make_tracers(agents), strict=True):
+        traces = replay_episodes(agent.policies, agent.world, selected_episodes, agent.row)
+        players.append(_Player(agent.name, agent.row, shift, agent.world.banks[0], tracer, traces))
 
     # The agent in the layout of training is one more player, and the only one in other scenes.
-    layout_worlds = [world]
-    layout_of_player = [0] * len(agents)
-    layout_shifts = [shift] * len(agents)
+    worlds_by_shift = {shift: agents[0].world}
     if trained_layout is not None and trained_traces is not None:
         comparisons[LAYOUT_PAIR] = (len(players), main_index)
-        players.append(f"{main_agent.name}, shift {trained_layout.shift:g}")
-        thresholds.append(main_agent.row.epsilon)
-        traces_by_agent.append(trained_traces)
-        rows.append(main_agent.row)
-        tracers.append(tracers[main_index])
-        layout_worlds.append(trained_layout.world)
-        layout_of_player.append(1)
-        layout_shifts.append(trained_layout.shift)
+        player_name = f"{main_agent.name}, shift {trained_layout.shift:g}"
+        trained_bank = trained_layout.world.banks[0]
+        tracer = players[main_index].tracer
+        players.append(_Player(player_name, main_agent.row, trained_layout.shift, trained_bank, tracer, trained_traces))
+        worlds_by_shift[trained_layout.shift] = trained_layout.world
         for counts in differ:
             counts.append(None)
         differ.append([None] * len(players))
 
-    # One plan for each scene and layout, with a view from every pose that any agent visits there.
-    scene_plans: list[ScenePlan] = []
-    plan_index: dict[tuple[int, int], int] = {}
-    poses_by_plan = []
-    scene_by_plan: list[Scene] = []
-    for layout, layout_world in enumerate(layout_worlds):
-        layout_bank = layout_world.banks[0]
-        scene_indices = np.unique(selected_episodes.scene).tolist()
-        scene_by_name = find_scenes(layout_world, [layout_bank.names[scene] for scene in scene_indices])
-        for scene in scene_indices:
-            visited_poses = []
-            for player_layout, traces in zip(layout_of_player, traces_by_agent, strict=True):
-                if player_layout == layout:
-                    for episode_index in np.flatnonzero(selected_episodes.scene == scene):
-                        visited_poses.append(traces[episode_index].pose)
-            poses = np.unique(np.concatenate(visited_poses))
-            plan_index[layout, scene] = len(scene_plans)
-            poses_by_plan.append(poses)
-            scene_by_plan.append(scene_by_name[layout_bank.names[scene]])
-            scene_plans.append(make_plan(scene_by_plan[-1], layout_bank, scene, poses))
-
-    # One trace for each episode and agent.
+    # Plans of the scenes in each layout, then one trace for each episode and player.
+    plans = _make_plans(players, selected_episodes, worlds_by_shift)
     replay_episode_list = []
     for episode_index in range(len(selected_episodes.goal)):
         scene = int(selected_episodes.scene[episode_index])
         goal = int(selected_episodes.goal[episode_index])
         courses = []
-        for layout, row, tracer, traces in zip(layout_of_player, rows, tracers, traces_by_agent, strict=True):
-            plan = plan_index[layout, scene]
-            trace = traces[episode_index]
-            course = _make_trace(trace, plan, poses_by_plan[plan], has_layout=row.arm == "layout")
-            if tracer is not None:
-                layout_bank = layout_worlds[layout].banks[0]
-                frames = _make_belief_frames(tracer, trace, layout_bank, scene, scene_by_plan[plan], goal)
-                course = dataclasses.replace(course, belief=frames)
-            courses.append(course)
+        for player in players:
+            courses.append(_trace_player(player, plans[player.shift, scene], episode_index, scene, goal))
         best_length = int(selected_episodes.best_length[episode_index])
-        replay_episode_list.append(ReplayEpisode(plan_index[0, scene], goal, best_length, courses))
+        replay_episode_list.append(ReplayEpisode(plans[shift, scene].plan_index, goal, best_length, courses))
 
-    # Names, thresholds and differences stand in the order of the agents.
+    # Names, thresholds and differences stand in the order of the players.
+    task = agents[0].world.banks[0].task
     return Replays(
         shift=shift,
         split=split,
-        categories=list(bank.task.categories),
-        players=players,
-        layouts=layout_shifts,
+        categories=list(task.categories),
+        players=[player.name for player in players],
+        layouts=[player.shift for player in players],
         comparisons=comparisons,
-        thresholds=thresholds,
+        thresholds=[player.row.epsilon for player in players],
         differ=differ,
         evaluated=len(episodes.goal),
-        field_of_view=bank.task.rules.field_of_view[0],
+        field_of_view=task.rules.field_of_view[0],
         reach=round(100 * MAX_RANGE),
-        plans=scene_plans,
+        plans=[plan.drawing for plan in plans.values()],
         episodes=replay_episode_list,
     )
+
+
+class _Player(NamedTuple):
+    """An agent that plays the selected episodes in one layout.
+
+    Attributes:
+      name: name on the page.
+      row: use of its policies.
+      shift: layout shift of its scenes.
+      bank: tables of its scenes.
+      tracer: tracer of its belief; None without one.
+      traces: the episodes as it played them.
+    """
+
+    name: str
+    row: EvaluationRow
+    shift: float
+    bank: Bank
+    tracer: BeliefTracer | None
+    traces: Sequence[EpisodeTrace]
+
+
+class _VisitedScene(NamedTuple):
+    """Scene in which episodes were played.
+
+    Attributes:
+      plan_index: index of its plan on the page.
+      scene: the scene.
+      poses: int [V], poses that any player visited, rising.
+      drawing: its plan, with a view from each of these poses.
+    """
+
+    plan_index: int
+    scene: Scene
+    poses: np.ndarray
+    drawing: ScenePlan
+
+
+def _make_plans(
+    players: Sequence[_Player], episodes: EpisodeList, worlds_by_shift: Mapping[float, CompiledWorld]
+) -> dict[tuple[float, int], _VisitedScene]:
+    """Draw a plan for each layout shift and scene, with a view from every pose that any player visits there."""
+    plans: dict[tuple[float, int], _VisitedScene] = {}
+    scene_indices = np.unique(episodes.scene).tolist()
+    for shift, world in worlds_by_shift.items():
+        bank = world.banks[0]
+        scene_by_name = find_scenes(world, [bank.names[scene_index] for scene_index in scene_indices])
+        for scene_index in scene_indices:
+            visited_poses = []
+            for player in players:
+                if player.shift == shift:
+                    for episode_index in np.flatnonzero(episodes.scene == scene_index).tolist():
+                        visited_poses.append(player.traces[episode_index].pose)
+            poses = np.unique(np.concatenate(visited_poses))
+            scene = scene_by_name[bank.names[scene_index]]
+            drawing = make_plan(scene, bank, scene_index, poses)
+            plans[shift, scene_index] = _VisitedScene(len(plans), scene, poses, drawing)
+    return plans
+
+
+def _trace_player(player: _Player, plan: _VisitedScene, episode_index: int, scene_index: int, goal: int) -> ReplayTrace:
+    """Return an episode of a player as data of the page."""
+    trace = player.traces[episode_index]
+    replay_trace = _make_trace(trace, plan.plan_index, plan.poses, has_layout=player.row.arm == "layout")
+    if player.tracer is None:
+        return replay_trace
+    frames = _make_belief_frames(player.tracer, trace, player.bank, scene_index, plan.scene, goal)
+    return dataclasses.replace(replay_trace, belief=frames)
 
 
 def _make_tracers(agents: Sequence[ReplayAgent]) -> list[BeliefTracer | None]:
