@@ -246,6 +246,33 @@ def _join_outcomes(parts: Sequence[Any]) -> Any:
     return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *parts)
 
 
+class _ResumableTrials:
+    """Runs trials of a run, unless an interrupted call finished them.
+
+    Args:
+      bench: keeps the outcomes of a part that is not finished.
+      run_name: name of the run, which is part of the names of kept outcomes.
+    """
+
+    def __init__(self, bench: Bench, run_name: str) -> None:
+        self._bench = bench
+        self._run_name = run_name
+        self._runner = TrialRunner(bench.config.seed)
+
+    def run(
+        self, name: str, evaluated_run: EvaluatedRun, estimator: EstimatorConfig | None, trials: Iterable[Trial]
+    ) -> dict[Trial, EpisodeOutcome]:
+        """Run trials under a name that is unique in the part."""
+        distinct_trials = list(dict.fromkeys(trials))
+
+        def measure() -> list[EpisodeOutcome]:
+            outcomes = self._runner.run_trials(evaluated_run, estimator, distinct_trials)
+            return [outcomes[trial] for trial in distinct_trials]
+
+        outcomes = self._bench.recall_outcomes(f"{self._run_name}: {name}", measure)
+        return dict(zip(distinct_trials, outcomes, strict=True))
+
+
 def _run_removals(
     bench: Bench,
     run: AgentRun,
@@ -257,31 +284,15 @@ def _run_removals(
     """Run the removals of a run and their controls in a mixed population; see `_measure_removals`."""
     # Where scores are a sum, complete removal leaves an agent without any experience, and no other agent is needed.
     # Else the layout-blind agents meet the same episodes, in as many training runs.
-    layout_blind_run = None
+    world, episodes, _ = population
+    layout_blind = None
     if not (remaining == "own" and run.config.policy_method.has_additive_scores):
         layout_blind_run = require_layout_blind_run(bench, run)
         bench.train(layout_blind_run)
-    bench.train(run)
-    world, episodes, _ = population
-    removals = bench.config.removals
-    runner = TrialRunner(bench.config.seed)
-
-    def run_trials(
-        name: str, evaluated_run: EvaluatedRun, estimator: EstimatorConfig | None, trials: Iterable[Trial]
-    ) -> dict[Trial, EpisodeOutcome]:
-        """Run trials, unless an interrupted call finished them."""
-        distinct_trials = list(dict.fromkeys(trials))
-
-        def measure() -> list[EpisodeOutcome]:
-            outcomes = runner.run_trials(evaluated_run, estimator, distinct_trials)
-            return [outcomes[trial] for trial in distinct_trials]
-
-        outcomes = bench.recall_outcomes(f"{run.name}: {name}", measure)
-        return dict(zip(distinct_trials, outcomes, strict=True))
-
-    layout_blind = None
-    if layout_blind_run is not None:
         layout_blind = EvaluatedRun(load_policies(layout_blind_run.config, ("baseline",)), world, episodes)
+
+    # Policies of the run, with the decision that removal leaves.
+    bench.train(run)
     policies = load_policies(run.config, ("layout",))
     match remaining:
         case "layout-blind":
@@ -291,54 +302,24 @@ def _run_removals(
             policies = policies.with_own_fallback()
     evaluated_run = EvaluatedRun(policies, world, episodes)
     estimator = require_estimator_config(policies)
+    trials = _ResumableTrials(bench, run.name)
 
     # References and removals that follow no gap are evaluated once, for all rules.
     bench.console.print("complete removal and removals that follow no gap")
-    fixed_trials = select_removals(list_fixed_trials(decoding, WORLDS[run.config.world].budgets[-1]), removals)
+    all_fixed_trials = list_fixed_trials(decoding, WORLDS[run.config.world].budgets[-1])
+    fixed_trials = select_removals(all_fixed_trials, bench.config.removals)
     plain_trial = Trial("layout", decoding)
     hard_trial = Trial("tde", decoding)
-    outcomes = run_trials("plain", evaluated_run, estimator, [plain_trial, hard_trial, *fixed_trials.values()])
+    outcomes = trials.run("plain", evaluated_run, estimator, [plain_trial, hard_trial, *fixed_trials.values()])
     layout_blind_outcome = outcomes[hard_trial]
     if layout_blind is not None:
         baseline_trial = Trial("baseline", decoding)
-        layout_blind_outcome = run_trials("layout-blind", layout_blind, None, [baseline_trial])[baseline_trial]
+        layout_blind_outcome = trials.run("layout-blind", layout_blind, None, [baseline_trial])[baseline_trial]
 
     hard_controls = {}
     if remaining == "own":
-        # Complete removal with counterfactual logits that know nothing of a part of this episode.
-        control_trials = {}
-        for name, control in select_removals(HARD_CONTROLS, removals).items():
-            control_trials[name] = Trial("tde", decoding, control=control)
-        control_outcomes = run_trials("controls", evaluated_run, estimator, control_trials.values())
-        hard_controls = {name: control_outcomes[trial] for name, trial in control_trials.items()}
-
-        # A counterfactual memory of its own is compared with the factual one.
-        if policies.spec.counterfactual_memory == "own":
-            factual_run = evaluated_run._replace(policies=policies.with_counterfactual_memory("factual"))
-            factual_outcomes = run_trials("factual memory", factual_run, estimator, [hard_trial])
-            hard_controls["TDE, factual memory"] = factual_outcomes[hard_trial]
-
-    # Soft removal by each gap, with the controls of its form.
-    permuted_run = evaluated_run._replace(policies=policies.with_permuted_evidence(bench.config.seed))
-    rule_outcomes = {}
-    rule_controls = {}
-    for name, rule in select_removals({str(rule): rule for rule in rules}, removals).items():
-        if not policies.supports_gap(rule.gap):
-            bench.console.print(f"{rule}: left out, for the run has no evidence for this gap; train it again")
-            continue
-        bench.console.print(name)
-        rule_estimator = dataclasses.replace(estimators_by_gap(estimator)[rule.gap], hold=rule.hold)
-        trial = Trial("stde", decoding, *rule.options)
-        controls: dict[str, Trial] = {}
-        for control in CONTROLS_BY_FORM[rule.options.form]:
-            controls[control] = dataclasses.replace(trial, control=control)
-        trial_outcomes = run_trials(name, evaluated_run, rule_estimator, [trial, *controls.values()])
-        rule_outcomes[name] = trial_outcomes[trial]
-        rule_controls[name] = {control: trial_outcomes[control_trial] for control, control_trial in controls.items()}
-        if rule.gap in EVIDENCE_GAPS:
-            permuted_outcomes = run_trials(f"{name}, permuted", permuted_run, rule_estimator, [trial])
-            rule_controls[name][PERMUTED_CONTROL] = permuted_outcomes[trial]
-
+        hard_controls = _run_hard_controls(bench, trials, evaluated_run, estimator, decoding)
+    rule_outcomes, rule_controls = _run_rules(bench, trials, evaluated_run, estimator, decoding, rules)
     return RemovalOutcomes(
         layout_blind=layout_blind_outcome,
         plain=outcomes[plain_trial],
@@ -348,6 +329,66 @@ def _run_removals(
         rules=rule_outcomes,
         rule_controls=rule_controls,
     )
+
+
+def _run_hard_controls(
+    bench: Bench,
+    trials: _ResumableTrials,
+    evaluated_run: EvaluatedRun,
+    estimator: EstimatorConfig,
+    decoding: Decoding,
+) -> dict[str, EpisodeOutcome]:
+    """Run complete removal of counterfactual logits that know nothing of a part of this episode."""
+    control_trials = {}
+    for name, control in select_removals(HARD_CONTROLS, bench.config.removals).items():
+        control_trials[name] = Trial("tde", decoding, control=control)
+    control_outcomes = trials.run("controls", evaluated_run, estimator, control_trials.values())
+    hard_controls = {name: control_outcomes[trial] for name, trial in control_trials.items()}
+
+    # A counterfactual memory of its own is compared with the factual one.
+    policies = evaluated_run.policies
+    if policies.spec.counterfactual_memory == "own":
+        factual_run = evaluated_run._replace(policies=policies.with_counterfactual_memory("factual"))
+        hard_trial = Trial("tde", decoding)
+        factual_outcomes = trials.run("factual memory", factual_run, estimator, [hard_trial])
+        hard_controls["TDE, factual memory"] = factual_outcomes[hard_trial]
+    return hard_controls
+
+
+def _run_rules(
+    bench: Bench,
+    trials: _ResumableTrials,
+    evaluated_run: EvaluatedRun,
+    estimator: EstimatorConfig,
+    decoding: Decoding,
+    rules: Sequence[RemovalRule],
+) -> tuple[dict[str, EpisodeOutcome], dict[str, dict[str, EpisodeOutcome]]]:
+    """Run soft removal by each gap, with the controls of its form; rules of unsupported gaps are left out.
+
+    Returns:
+      The outcome of each rule by its name, and those of its controls.
+    """
+    policies = evaluated_run.policies
+    permuted_run = evaluated_run._replace(policies=policies.with_permuted_evidence(bench.config.seed))
+    rule_outcomes = {}
+    rule_controls = {}
+    for name, rule in select_removals({str(rule): rule for rule in rules}, bench.config.removals).items():
+        if not policies.supports_gap(rule.gap):
+            bench.console.print(f"{rule}: left out, for the run has no evidence for this gap; train it again")
+            continue
+        bench.console.print(name)
+        rule_estimator = dataclasses.replace(estimators_by_gap(estimator)[rule.gap], hold=rule.hold)
+        trial = Trial("stde", decoding, *rule.options)
+        controls: dict[str, Trial] = {}
+        for control in CONTROLS_BY_FORM[rule.options.form]:
+            controls[control] = dataclasses.replace(trial, control=control)
+        trial_outcomes = trials.run(name, evaluated_run, rule_estimator, [trial, *controls.values()])
+        rule_outcomes[name] = trial_outcomes[trial]
+        rule_controls[name] = {control: trial_outcomes[control_trial] for control, control_trial in controls.items()}
+        if rule.gap in EVIDENCE_GAPS:
+            permuted_outcomes = trials.run(f"{name}, permuted", permuted_run, rule_estimator, [trial])
+            rule_controls[name][PERMUTED_CONTROL] = permuted_outcomes[trial]
+    return rule_outcomes, rule_controls
 
 
 def list_removal_names() -> list[str]:
