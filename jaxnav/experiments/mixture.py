@@ -42,7 +42,7 @@ from jaxnav.runs.policies import EVIDENCE_GAPS, estimators_by_gap, load_policies
 from jaxnav.runs.worlds import CompiledWorld, concatenate_worlds
 from jaxnav.scenes.worlds import WORLDS
 
-Removal = TypeVar("Removal")
+NamedRemoval = TypeVar("NamedRemoval")
 
 #: Decision that remains once experience is removed: that of the run's counterfactual logits, of the layout-blind
 #: agents, or of the same network under do(Z = 0).
@@ -192,7 +192,7 @@ def _measure_removals(
         populations.append(population)
         fold_outcomes.append(_run_removals(bench, fold_run, population, decoding, rules, remaining))
     episodes = join_episode_lists([population.episodes for population in populations])
-    shift_index = np.concatenate([population.shift for population in populations])
+    shift_index = np.concatenate([population.shift_index for population in populations])
     outcomes = RemovalOutcomes(*map(_join_outcomes, zip(*fold_outcomes, strict=True)))
 
     # Values of the agents themselves.
@@ -399,7 +399,7 @@ def list_removal_names() -> list[str]:
     return [*map(str, REMOVAL_RULES), *dict.fromkeys(fixed_names), *HARD_CONTROLS]
 
 
-def select_removals(removals: Mapping[str, Removal], patterns: tuple[str, ...]) -> dict[str, Removal]:
+def select_removals(removals: Mapping[str, NamedRemoval], patterns: tuple[str, ...]) -> dict[str, NamedRemoval]:
     """Select the removals whose names match one of several patterns."""
     return {name: removal for name, removal in removals.items() if matches_any(name, patterns)}
 
@@ -432,12 +432,12 @@ class MixedPopulation(NamedTuple):
     Attributes:
       world: the scenes of all shifts, concatenated.
       episodes: equally many episodes at each shift.
-      shift: int [E], index of each episode's shift.
+      shift_index: int [E], index of each episode's shift.
     """
 
     world: CompiledWorld
     episodes: EpisodeList
-    shift: np.ndarray
+    shift_index: np.ndarray
 
 
 def draw_mixed_population(bench: Bench, run: AgentRun, shifts: Sequence[float], num_folds: int = 1) -> MixedPopulation:
@@ -458,7 +458,7 @@ def draw_mixed_population(bench: Bench, run: AgentRun, shifts: Sequence[float], 
     return MixedPopulation(
         world=concatenate_worlds(worlds),
         episodes=join_end_to_end(episode_lists, num_poses),
-        shift=np.repeat(np.arange(len(shifts)), num_episodes),
+        shift_index=np.repeat(np.arange(len(shifts)), num_episodes),
     )
 
 
@@ -498,11 +498,11 @@ class PopulationMetrics:
 
     Args:
       episodes: episodes of the population.
-      shift: int [E], index of each episode's shift.
+      shift_index: int [E], index of each episode's shift.
       budgets: action budgets N of the additional metrics `sr@N`.
     """
 
-    def __init__(self, episodes: EpisodeList, shift: np.ndarray, budgets: Sequence[int]) -> None:
+    def __init__(self, episodes: EpisodeList, shift_index: np.ndarray, budgets: Sequence[int]) -> None:
         self.metric_names = ("sr", "spl", *(f"sr@{budget}" for budget in budgets))
         self._episodes = episodes
         self._budgets = budgets
@@ -510,8 +510,8 @@ class PopulationMetrics:
 
         # Each shift has clusters of its own, and so intervals of its own.
         self._subsets = []
-        for index in range(shift.max() + 1):
-            mask = shift == index
+        for index in range(shift_index.max() + 1):
+            mask = shift_index == index
             self._subsets.append(EpisodeSubset(mask, episodes.take(mask).clusters()))
 
     def percent_metrics(self, outcome: EpisodeOutcome) -> MetricValues:
