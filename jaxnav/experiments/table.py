@@ -289,7 +289,11 @@ def write_part(path: Path, settings: Mapping[str, Any], rows: Iterable[ResultRow
 
 
 def has_part(path: Path, settings: Mapping[str, Any]) -> bool:
-    """True if the file is undamaged and holds results of these settings."""
+    """True if the file is undamaged and holds results of these settings.
+
+    Raises:
+      InputError: as `read_settings`.
+    """
     return read_settings(path) == settings
 
 
