@@ -67,6 +67,7 @@ def test_stde_refuses_an_unknown_form():
         stde(jnp.ones(2), jnp.ones(2), jnp.float32(1), 0.0, "papr")  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", FORMS)
 @given(LOGITS, LOGITS, hnp.arrays(np.float32, 4, elements=UNIT))
 def test_stde_with_a_closed_gate_is_bit_identical(form, factual, counterfactual, gap):
@@ -95,6 +96,7 @@ def test_switch_form_gives_tde_or_the_factual_logits(factual, counterfactual, ga
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", SOFT)
 @given(LOGITS, LOGITS, UNIT, st.floats(0, 0.9990234375, width=32, allow_subnormal=False))
 def test_stde_is_continuous_in_epsilon(form, factual, counterfactual, gap, epsilon):

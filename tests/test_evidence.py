@@ -64,6 +64,7 @@ def area_under_curve(low_values: np.ndarray, high_values: np.ndarray) -> float:
     return float(mannwhitneyu(high_values, low_values).statistic / (len(low_values) * len(high_values)))
 
 
+@pytest.mark.slow
 def test_evidence_gap_follows_worked_arithmetic():
     """0 is seen with 2. Row 0: p = (-, 3/4, 1/4), a = 4, so p . p = 0.625; then q = (-, 3/5, 2/5) and p . q = 0.55.
 
@@ -101,6 +102,7 @@ def test_evidence_gap_agrees_with_scipy(seed, views):
     np.testing.assert_allclose(state.gap, expected, atol=1e-4)
 
 
+@pytest.mark.slow
 @given(SEEDS, VIEWS, st.permutations(range(NUM_CATEGORIES)))
 def test_evidence_gap_is_bounded_starts_at_zero_and_ignores_category_order(seed, views, order):
     """0 before anything is seen, always in [0, 1], and the same whatever the categories are called."""
@@ -114,6 +116,7 @@ def test_evidence_gap_is_bounded_starts_at_zero_and_ignores_category_order(seed,
     np.testing.assert_allclose(renamed, gaps, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_evidence_gap_of_a_uniform_prior_is_zero():
     views = np.random.default_rng(0).random((20, NUM_STEPS, NUM_CATEGORIES)) < 0.3
     assert gaps_of(prior_from_counts(jnp.ones((NUM_CATEGORIES, NUM_CATEGORIES)), "evidence"), views).max() < 0.01
@@ -134,6 +137,7 @@ def test_misfits_raise_the_evidence_gap_and_fitting_views_lower_it():
     assert gaps[-1] < gaps[5] / 2
 
 
+@pytest.mark.slow
 def test_closed_gate_keeps_the_evidence_gap():
     """No decay: with nothing new the evidence is what it was. Belief and accepted view are those of `calibrated`."""
     views = np.zeros((4, NUM_CATEGORIES), bool)
@@ -152,6 +156,7 @@ def test_closed_gate_keeps_the_evidence_gap():
     assert ESTIMATORS["evidence"] == EstimatorConfig(gap="evidence")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("independent", [False, True])
 def test_evidence_gap_exceeds_its_level_in_the_expected_share_of_layouts(independent):
     """Layouts drawn from the prior: D = 2 P - 1 with P uniform where one row is seen, nearer 1/2 where all are.
@@ -174,6 +179,7 @@ def test_evidence_gap_exceeds_its_level_in_the_expected_share_of_layouts(indepen
         assert abs((gaps > 0.5).mean() - 0.25) < 0.05
 
 
+@pytest.mark.slow
 def test_evidence_gap_tells_layouts_apart():
     """Views drawn from the prior keep it low, the same with categories renamed at random raise it, and by evidence."""
     generator, prior = np.random.default_rng(0), zoned_prior()

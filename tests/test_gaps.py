@@ -67,6 +67,7 @@ def test_learned_gap_follows_worked_arithmetic():
     assert float(learned_gap(jnp.zeros((4, 4), bool), log_odds)) == 0.5
 
 
+@pytest.mark.slow
 def test_sightings_follow_worked_arithmetic():
     """Two categories, seen one after the other, and then together.
 
@@ -110,6 +111,7 @@ def test_near_features_grow_with_the_number_of_views():
     np.testing.assert_array_equal(features.sum(axis=1), [sum(n >= m for m in NEAR_VIEW_COUNTS) for n in range(25)])
 
 
+@pytest.mark.slow
 def test_surprise_needs_geometry_and_evidence():
     estimator = LayoutEstimator(PRIOR, EstimatorConfig(gap="surprise"), EVIDENCE)
     view = jnp.ones(NUM_CATEGORIES, bool)
@@ -120,6 +122,7 @@ def test_surprise_needs_geometry_and_evidence():
         estimator.update(estimator.init(), view, None, geometry)
 
 
+@pytest.mark.slow
 def test_offsets_and_odometry_give_the_places_of_the_detections():
     """Along a walk through a drawn room, agent plus offset is the place in the world, by the NumPy formula."""
     scene = draw(["....."] * 5, ("Book", 0.5, 0.9, 1.5, 0.2, 0.2, 0.2), ("Fridge", 1.6, 1.0, 0.4, 0.4, 1.8, 0.4))
@@ -191,6 +194,7 @@ def test_learned_gap_sums_the_log_odds_of_pairs_seen_so_far(views):
         np.testing.assert_allclose(gap, 1 / (1 + np.exp(-sum(log_odds[pair] for pair in pairs))), rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap", ["novelty", "evidence", "learned", "overdue", "clock", "none"])
 @given(VIEWS)
 def test_held_gap_is_the_running_maximum(gap, views):
@@ -200,6 +204,7 @@ def test_held_gap_is_the_running_maximum(gap, views):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap", ["learned", "overdue"])
 def test_learned_and_overdue_gaps_do_not_change_the_belief(gap):
     views = GENERATOR.random((4, NUM_CATEGORIES)) < 0.5

@@ -60,6 +60,7 @@ def test_prior_rows_of_unseen_categories_are_uniform():
     np.testing.assert_allclose(alpha[1], [2, 0, 2, 2, 2, 2], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_calibrated_update_follows_worked_arithmetic():
     """S = 20, uniform prior, K = 22, V = 3: every entry is 20 / 21, each visible row gains two counts of one.
 
@@ -103,6 +104,7 @@ def views_of(*sets) -> np.ndarray:
     return np.array([[i in visible for i in range(NUM_CATEGORIES)] for visible in sets])
 
 
+@pytest.mark.slow
 def test_disabling_the_gap_does_not_change_the_belief():
     counts = jnp.arange(16.0).reshape(4, 4) + 1.0
     setting = ESTIMATORS["calibrated"]
@@ -208,6 +210,7 @@ def test_mean_visible_of_a_single_category_is_its_own_divergence():
     )
 
 
+@pytest.mark.slow
 def test_closed_gate_keeps_the_belief_and_decays_the_gap():
     alpha = prior_from_counts(random_counts())
     state = make_state(alpha, views_of({0, 1})[0], 0.5)
@@ -220,6 +223,7 @@ def test_closed_gate_keeps_the_belief_and_decays_the_gap():
     assert float(estimator.update(state, jnp.asarray(views_of({0, 2})[0])).alpha.sum()) > float(alpha.sum()) + 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["paper", "calibrated"])
 @given(PRESENCE)
 def test_expectation_is_normalized_and_paper_belief_ignores_order(name, views):
@@ -347,6 +351,7 @@ def test_relative_weights_have_mean_one_and_ignore_a_common_factor(raw_weights, 
     np.testing.assert_allclose(np.asarray(scaled_weights)[off_goal], relative_weights[off_goal], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_relative_weights_of_a_disabled_layout_are_ones_to_the_bit():
     for num_categories in (2, 3, 15, 22):
         ones = jnp.ones(num_categories)

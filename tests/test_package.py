@@ -126,6 +126,7 @@ def test_shortest_method_passes_ruff_and_pyright(method_folder):
     assert [is_clean(check) for check in checks] == [False] * 3
 
 
+@pytest.mark.slow
 def test_shortest_method_makes_experience(method_folder, monkeypatch):
     monkeypatch.syspath_prepend(method_folder)
     spec = dataclasses.replace(tiny.SPEC, method=find_method("shortest:SHORTEST"), method_sizes=())

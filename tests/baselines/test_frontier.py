@@ -145,6 +145,7 @@ def test_frontier_walk_depends_on_perception_alone(seed, start_pose, goal):
     assert [action for _, action in blind_walk] == expected_actions
 
 
+@pytest.mark.slow
 @settings(max_examples=20)
 @given(seed=st.integers(0, 20), rules=st.sampled_from([ROOMS, APARTMENTS, HOUSES]))
 def test_frontier_never_moves_into_an_obstacle(seed, rules):

@@ -82,6 +82,7 @@ def test_planner_searches_near_the_clue_its_model_trusts():
     assert mean_length[FRIDGE] + 4 < mean_length[CHAIR]
 
 
+@pytest.mark.slow
 @settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 999), rules=st.sampled_from([ROOMS, APARTMENTS]))
 def test_planner_uses_nothing_it_has_not_detected(seed, rules):

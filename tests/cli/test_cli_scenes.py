@@ -32,6 +32,7 @@ def write_lines(path, *documents):
 # Formats, splits and selections
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene_format", FORMATS)
 def test_import_makes_an_environment_of_every_format(tmp_path, capsys, scene_format):
     source = scene_format.write(tmp_path, scene_format.content)

@@ -140,6 +140,7 @@ def test_streamed_evaluation_compiles_once_and_visits_all_scenes(finished, tmp_p
     assert scenes == {f"train-{room}-{i:03d}" for i, room in enumerate((2 * ROOM_TYPES + ROOM_TYPES)[:9])}
 
 
+@pytest.mark.slow
 def test_sharded_world_equals_the_world_in_memory(world, cache):
     whole = RunConfig(worlds=WorldConfig(num_train=9), cache=cache)
     memory = compile_training_world(whole, Console(file=io.StringIO()))

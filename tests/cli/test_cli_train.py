@@ -229,6 +229,7 @@ def test_train_names_bad_scene_files(tmp_path, capsys, data, problem):
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.slow
 def test_train_refuses_directories_that_hold_no_run(tmp_path, config_file, capsys):
     foreign_file = tmp_path / "file"
     foreign_file.write_text("mine")

@@ -151,6 +151,7 @@ def test_help_on_a_terminal_without_unicode_is_readable():
     assert "--follow" in output
 
 
+@pytest.mark.slow
 def test_scripts_of_the_repository_have_the_help_of_their_command(capsys, monkeypatch):
     root = Path(__file__).parents[2]
     for script in ("train", "eval"):

@@ -41,6 +41,7 @@ def test_scenes_show_writes_a_png_of_the_figure_size(file, tmp_path, capsys):
     assert [path.name for path in out.parent.iterdir()] == ["hall.png"]
 
 
+@pytest.mark.slow
 def test_scenes_show_selects_by_name_number_or_the_first(file, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     pictures = {}
@@ -79,6 +80,7 @@ def test_scenes_show_warns_beyond_the_usual_number_of_scenes(file, tmp_path, cap
         assert ("--worlds.num-val 21" in message) == is_beyond
 
 
+@pytest.mark.slow
 def test_scenes_show_refuses_bad_requests(file, tmp_path, capsys):
     (tmp_path / "folder.png").mkdir()
     out = ("--out", tmp_path / "no.png")

@@ -56,6 +56,7 @@ def test_step_limit_truncates_the_episode():
     assert (state.time, state.pose) == (3, 0)
 
 
+@pytest.mark.slow
 def test_final_observation_is_of_the_episode_that_ends():
     env, params = build_environment(BANK, {}, 1)  # every step ends an episode
     num_episodes = 400

@@ -92,6 +92,7 @@ def test_dict_space_contains_mappings_and_objects():
     assert bool(BOTH.contains(Observation(row=row, goal=goal)))
 
 
+@pytest.mark.slow
 def test_observation_space_contains_the_observations_of_reset_and_step():
     num_envs = 16
     contains = jax.jit(jax.vmap(ENV.observation_space(PARAMS).contains))
@@ -122,6 +123,7 @@ def test_action_space_is_that_of_the_task():
         assert not bool(space.contains(jnp.int32(NUM_ACTIONS)))
 
 
+@pytest.mark.slow
 def test_only_done_of_all_actions_terminates():
     _, state = ENV.reset(jax.random.key(0), PARAMS)
     advance = jax.vmap(functools.partial(ENV.advance, state, params=PARAMS))

@@ -62,6 +62,7 @@ class Predictor:
         return np.where(is_blocked, ROTATE_RIGHT, MOVE_AHEAD), time + 1
 
 
+@pytest.mark.slow
 def test_all_kinds_of_agents_give_equal_outcomes():
     outcome = run(Walker(jnp.int32(ROTATE_RIGHT)))
     # The agent never says Done, so every episode takes the limit of its scene: 6 in the kitchen, 8 in the bedroom.

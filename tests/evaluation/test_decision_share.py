@@ -91,6 +91,7 @@ def test_a_policy_that_ignores_experience_has_shares_of_zero(probe):
     assert (shares[:, ReplacedPart.SCENE_AND_GOAL - 1] > 0.05).all()
 
 
+@pytest.mark.slow
 def test_a_policy_of_experience_alone_depends_on_no_direct_pathway(probe):
     _, shares = probe(use_only_experience)
     assert (shares[:, ReplacedPart.SCENE_AND_GOAL - 1] == 0).all()
@@ -116,6 +117,7 @@ def replaced_parts_of(agent, partner, part, layout_weights=None):
     return replace(tiny.random_params(6), agent)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "part", [ReplacedPart.OTHER_CATEGORIES, ReplacedPart.EXPERIENCE, ReplacedPart.SCENE_AND_GOAL, ReplacedPart.MEMORY]
 )

@@ -139,6 +139,7 @@ def test_parts_share_a_compilation_and_cells_and_episodes_are_independent(outcom
         )
 
 
+@pytest.mark.slow
 def test_evaluator_takes_a_single_episode():
     grid = tiny.leaves_at(CELLS, slice(1))
     result = Evaluator(AGENT_LOOP)(grid, WEIGHTS, [(select_episodes(np.array([3])), PARAMS)], KNOWLEDGE, KEY)
@@ -175,6 +176,7 @@ def run_plain_loop(seed, episode, layout, epsilon, form) -> dict[str, Any]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("variant", "epsilon", "form"),
     [("baseline", None, None), ("layout", None, None), ("stde", 0.0, "paper"), ("stde", 0.2, "residual")],
@@ -189,6 +191,7 @@ def test_grid_outcomes_equal_a_plain_loop(outcome, variant, epsilon, form):
                 assert getattr(result, name)[seed, episode] == pytest.approx(value, rel=1e-4, abs=1e-6), (name, episode)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", range(len(CONTROLS)))
 def test_control_outcomes_equal_a_loop_that_keeps_ended_episodes(outcome, number):
     """Leaving ended episodes out changes no one's next running episode and no one's noise."""
@@ -213,6 +216,7 @@ def test_control_outcomes_equal_a_loop_that_keeps_ended_episodes(outcome, number
         np.testing.assert_allclose(result.mean_weight, total_weight / length, rtol=1e-5, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_played_episodes_agree_with_the_grid(outcome):
     row = ROWS.index(EvaluationRow("stde", 0.2, "residual", "argmax"))
     cell = tiny.leaves_at(CELLS, row * SEEDS + 1)

@@ -154,6 +154,7 @@ class ConcatenatingPolicy:
         return Decision(logits=logits, value=logits[:, 0], hidden=memory.hidden)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("max_value", [0.25, 2.0])
 def test_a_random_intervention_sets_scene_and_goal_alone(max_value):
     num_episodes, policy = 500, cast(Policy, ConcatenatingPolicy())

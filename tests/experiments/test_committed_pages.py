@@ -93,6 +93,7 @@ def test_committed_results_are_written_as_they_were_read(name, tmp_path):
 OTHER_TEMPLATES = ["table2", "table3", "study_rooms", "accounts", "removal_houses"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", params_by_tier(COMMITTED, fast=["claims", "streams"], slow=OTHER_TEMPLATES))
 def test_pages_can_be_written_from_the_first_result_on(name, tmp_path):
     """Pages are written after every part, so that an interrupted experiment has them."""

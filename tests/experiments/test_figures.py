@@ -230,6 +230,7 @@ def test_equal_data_gives_equal_bytes(name, tmp_path):
         assert not set(png.info) - {"dpi"}  # neither a date nor a version
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", params_by_tier(DRAWINGS, fast=["epsilon"], slow=DRAWINGS))
 def test_all_text_is_inside_the_figure(name):
     figure = DRAWINGS[name]()
@@ -257,6 +258,7 @@ def make_table(*rows: dict) -> ResultTable:
     return ResultTable([ResultRow(**{**FIELDS, **row}) for row in rows])
 
 
+@pytest.mark.slow
 def test_the_similarity_figures_are_drawn_from_rows_by_point_and_category():
     rows = []
     stde = {"variant": "stde", "decoding": "argmax", "form": "residual", "epsilon": 0.5}
@@ -284,6 +286,7 @@ def test_the_similarity_figures_are_drawn_from_rows_by_point_and_category():
     np.testing.assert_allclose(marked_lines(axes[3])[0], [[0, 7], [1, 2], [2, -1]])
 
 
+@pytest.mark.slow
 def test_the_epsilon_figure_is_drawn_from_sweeps_with_best_actions():
     rows = []
     for (shift, form), metrics_by_epsilon in SWEEPS.items():
@@ -301,6 +304,7 @@ def test_the_epsilon_figure_is_drawn_from_sweeps_with_best_actions():
         np.testing.assert_allclose(marked_lines(axes), marked_lines(expected))
 
 
+@pytest.mark.slow
 def test_the_gap_figures_are_drawn_from_curves_of_the_outer_shifts():
     shifts = (0.0, 0.5, 1.0)
     rows = []

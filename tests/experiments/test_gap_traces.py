@@ -124,6 +124,7 @@ def test_calibration_compares_the_mean_gap_of_each_bin_with_the_share_of_shifted
     assert calibration.error.mean == pytest.approx((0.95 - 2 / 3) / 2 + (1 / 3 - 0.13) / 2)
 
 
+@pytest.mark.slow
 def test_a_gap_drawn_from_its_own_probability_is_calibrated():
     # An episode with gap D is shifted with probability D. The share in a bin of 4,000 episodes has a standard
     # deviation of at most 0.8 points. The square of the gap has the same order and another level.

@@ -46,6 +46,7 @@ def succeed(rows, policies, world, num_episodes, seed):
     return episode_lists, outcome, 1
 
 
+@pytest.mark.slow
 def test_agents_that_always_succeed_have_a_success_of_100_percent(drawn_run, monkeypatch):
     monkeypatch.setattr("jaxnav.experiments.instrument.evaluate_rows", succeed)
     world = compile_evaluation_world(drawn_run.config, "val", None, 0.0, Console(quiet=True))

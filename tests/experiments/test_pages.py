@@ -353,6 +353,7 @@ def test_the_study_claims_nothing_else(study_page):
     assert len(read_lines(claims)) == len(CLAIMS) + 2  # header and rule
 
 
+@pytest.mark.slow
 def test_a_claim_without_results_has_the_verdict_of_no_effect(tmp_path):
     rows = [row for row in study_rows() if row.metric != "sr growth" and row.variant != "tde"]
     text = render(tmp_path, "study", *rows)
@@ -384,6 +385,7 @@ def test_epsilon_is_chosen_on_val_and_applied_on_test(tmp_path):
     assert "40.0" in chosen_lines[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("template", ["methods", "factors"])
 @pytest.mark.parametrize("split", ["val", "test"])
 def test_pages_compare_both_splits_and_judge_gains_on_test(tmp_path, template, split):
@@ -567,6 +569,7 @@ def test_methods_with_idle_experience_have_no_verdict(tmp_path):
     assert effect_of_weights == '<span class="idle">+5.0 [+4.0, +6.0]</span>'
 
 
+@pytest.mark.slow
 def test_claims_of_the_study_on_idle_experience_have_no_verdict(tmp_path):
     # The share of the arm with w counts: 4 %. The loss of the baseline is a claim on neither w nor sTDE.
     shares = [make_share("main", "baseline", 20.0), make_share("main", "layout", 4.0)]

@@ -342,6 +342,7 @@ def test_training_rows_count_steps_seconds_and_success(drawn_run, make_bench, tm
     assert table.find(fields, metric="val sr at the end").mean == 50
 
 
+@pytest.mark.slow
 def test_frontier_rows_are_searches_of_the_same_episodes(make_bench, drawn_run):
     bench = make_bench(shifts=(0.0, 1.0))
     table = ResultTable(measure_frontier(bench, bench.find_run("rooms", "main")))

@@ -305,6 +305,7 @@ def test_trials_vary_gap_threshold_and_controls(make_bench):
     assert table.find(AT, metric="parameters").mean > 1000
 
 
+@pytest.mark.slow
 def test_runs_without_a_baseline_arm_have_only_the_variants_of_the_layout(make_bench, drawn_run):
     bench = make_bench()
     run = bench.find_run("rooms", "main")

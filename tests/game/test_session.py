@@ -138,6 +138,7 @@ def logits_and_next_memories(observation, memory, **odometry):
     return choice.logits, next_memories
 
 
+@pytest.mark.slow
 def test_game_advice_is_the_policys_choice_along_the_players_way():
     game = start_longest_game(POLICY)
     keys = ["w", "a", "f", "d", "w"]

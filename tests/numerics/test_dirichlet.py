@@ -91,6 +91,7 @@ def test_presence_kl_is_accurate_in_float32(increment):
         assert error.max() < 2e-5, kind
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("max_count", [1, 3, 40])
 def test_counts_kl_is_accurate_in_float32(max_count):
     """Counts from 0 to 1, 3 and 40 in one row, and priors up to the sums of a million random views."""
@@ -106,6 +107,7 @@ def test_counts_kl_is_accurate_in_float32(max_count):
         assert error[(scale * prior >= 1).all(axis=-1)].max(initial=0) < 1e-5, kind
 
 
+@pytest.mark.slow
 def test_counts_kl_follows_worked_arithmetic():
     """KL(Dir(6, 3) || Dir(6, 2)) = ln 4 + psi(3) - psi(9), and two counts at once for Dir(3, 1) against Dir(1, 1)."""
     np.testing.assert_allclose(counts_kl(jnp.array([6.0, 2]), jnp.array([0.0, 1])), 0.168437, rtol=1e-5)
@@ -124,6 +126,7 @@ def test_counts_kl_equals_presence_kl_for_equal_counts(increment):
         assert (difference <= 6e-5 * sum_of_entry_divergences(prior, counts.astype(int)) + 1e-30).all()
 
 
+@pytest.mark.slow
 def test_presence_kl_sums_over_the_last_axis_only():
     rng = np.random.default_rng(0)
     prior = jnp.asarray(rng.uniform(0.1, 5, (3, 4, 6)), jnp.float32)

@@ -10,6 +10,7 @@ from support.numerics import normal_array
 from jaxnav.numerics.product import Linear, matmul_rows
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [9, 0])
 @pytest.mark.parametrize("shape", [(), (6,), (2, 3, 5)])
 def test_matmul_rows_has_value_and_gradients_of_matmul(shape, width):

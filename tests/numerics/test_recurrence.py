@@ -35,6 +35,7 @@ def unroll_by_definition(kernel, input_gates, ended, hidden):
     return UnrolledGRU(jnp.stack(hidden_after), jnp.stack(hidden_before), jnp.stack(hidden_gates))
 
 
+@pytest.mark.slow
 def test_gru_step_equals_the_cell_of_flax():
     cell = nnx.GRUCell(3, HIDDEN, rngs=nnx.Rngs(0))
     hidden = normal_array(3, BATCH, HIDDEN)
@@ -57,6 +58,7 @@ def test_unroll_gru_starts_from_zero_after_an_ending(rollout):
     np.testing.assert_array_equal(unrolled.hidden_before[1], unrolled.hidden_after[0])
 
 
+@pytest.mark.slow
 def test_unroll_gru_has_the_gradients_of_the_loop_with_a_second_decision(rollout):
     """The second decision uses the hidden states and their products with the kernel."""
     kernel, input_gates, ended, first_hidden = rollout
@@ -85,6 +87,7 @@ def test_unroll_gru_has_the_gradients_of_the_loop_with_a_second_decision(rollout
     assert np.abs(np.asarray(gradients[0] - first_gradient)).max() > 0.1
 
 
+@pytest.mark.slow
 def test_gradients_of_unroll_gru_without_compilation(rollout):
     def loss(kernel):
         return jnp.sin(unroll_gru(kernel, *rollout[1:]).hidden_after).sum()

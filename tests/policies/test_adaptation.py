@@ -224,6 +224,7 @@ def test_training_gradient_from_the_middle_of_a_window_reaches_its_stored_inputs
     assert np.abs(other_gradient["fuse"]["kernel"] - gradient["fuse"]["kernel"]).max() > 1e-3 * scale
 
 
+@pytest.mark.slow
 def test_learned_loss_is_the_norm_of_two_causal_convolutions():
     loss = LearnedLoss(nnx.Rngs(params=0))
     rows = np.random.default_rng(0).normal(size=(WINDOW, 9)).astype(np.float32)

@@ -54,6 +54,7 @@ def test_what_else_is_detected_does_not_matter():
     np.testing.assert_array_equal(alone, among)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["rgb", "org"])
 def test_for_other_agents_both_matter(method):
     """The negative control."""

@@ -101,6 +101,7 @@ def random_policy_params(method=BELIEF, seed=0):
 # Squares and looks
 
 
+@pytest.mark.slow
 def test_squares_are_those_of_a_twin():
     rng = np.random.default_rng(0)
     cells = random_cells(rng)
@@ -120,6 +121,7 @@ def neighbours(row, column, radius):
     return np.ix_((row + span) % NUM_SQUARES, (column + span) % NUM_SQUARES)
 
 
+@pytest.mark.slow
 def test_features_of_a_square_are_those_of_a_twin():
     rng = np.random.default_rng(1)
     categories = rng.choice(np.array([0, 0, 0, 0, 0, 0, 0, 0, 1, 2, 4], np.uint32), (NUM_SQUARES, NUM_SQUARES))
@@ -176,6 +178,7 @@ def test_target_scores_are_the_log_of_the_probability_around_a_target_per_action
         np.testing.assert_allclose(scores[row, column], expected, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_only_unexplored_squares_that_can_be_reached_are_targets():
     """A closed chamber of 6 x 6 cells around the agent, in which one cell is unexplored."""
     cells = np.zeros((32, 32), np.uint32)
@@ -226,6 +229,7 @@ def score_pathways(method, params):
     return decide(params)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [BELIEF, DIRICHLET], ids=["loglinear", "dirichlet"])
 def test_equation_1_is_the_search_by_places_bit_for_bit(method):
     params = random_policy_params(method)
@@ -241,6 +245,7 @@ def test_equation_1_is_the_search_by_places_bit_for_bit(method):
     np.testing.assert_array_equal(no_experience, np.zeros_like(no_experience))
 
 
+@pytest.mark.slow
 def test_removal_from_target_scores_is_equation_2_in_its_paper_form():
     _, logits, counterfactual = score_pathways(BELIEF, random_policy_params())
     gap = jnp.array([0.0, 0.3, 0.9, 1.0])
@@ -262,6 +267,7 @@ def test_removal_from_target_scores_is_equation_2_in_its_paper_form():
     np.testing.assert_array_equal(weight, gap)
 
 
+@pytest.mark.slow
 def test_mixture_form_scores_targets_by_the_mixture_of_beliefs():
     rng = np.random.default_rng(0)
     log_places, log_layout, log_cost = rng.normal(size=(3, MAP_SQUARES, MAP_SQUARES)).astype(np.float32)
@@ -277,6 +283,7 @@ def test_mixture_form_scores_targets_by_the_mixture_of_beliefs():
         np.testing.assert_allclose(mixed, expected, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_scores_are_computed_only_where_a_target_is_due():
     _, inputs = make_agent()
     is_due = jnp.array([True, False, False, True])
@@ -343,6 +350,7 @@ def test_rates_are_hits_per_look_and_rare_categories_have_the_mean_rate():
     np.testing.assert_allclose(rates[:, 1], [0.5, 0.5], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_looks_at_an_object_are_counted_by_distance_and_hit_where_it_is_detected():
     """Looking north in a corridor at a book 4 cells ahead: a look from 1 m, and a hit."""
     bank = compile_bank([corridor_scene(24)], Task(CATEGORIES, detector=PERFECT_DETECTOR))

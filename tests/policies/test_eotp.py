@@ -64,6 +64,7 @@ def with_parts(*parts):
 # Attention
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("detected", "goal", "is_attended"),
     [
@@ -164,6 +165,7 @@ def test_first_attention_of_an_episode_uses_the_goal_alone():
     np.testing.assert_allclose(shares, attention_shares(view, START_MEMORY, goal_only), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_fresh_attention_depends_on_the_goal_from_the_start():
     params = init_params(SPEC, jax.random.key(0))
     method = bind_attention(params)

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from support.scenes import CATEGORIES
 from support.tiny_world import BANK
 
@@ -42,6 +43,7 @@ def test_a_goal_that_is_not_detected_has_its_flag_alone():
     np.testing.assert_array_equal(table[:, -1], [0, 1, 0])
 
 
+@pytest.mark.slow
 def test_features_of_every_row_of_a_bank_are_finite_and_of_order_one():
     seen = unpack_features(jnp.asarray(BANK.rows), jnp.zeros(len(BANK.rows), jnp.int32), RowFormat(K))
     assert (np.abs(np.concatenate(jax.tree.map(np.ravel, list(seen)))) <= 2).all()

@@ -178,6 +178,7 @@ def test_reference_removal_leaves_the_network_without_experience_to_the_bit(meth
     assert np.abs(removed_by_step[-1] - factual_by_step[-1]).max() > 0.05
 
 
+@pytest.mark.slow
 def test_half_of_the_reference_removal_lies_midway():
     """The form `paper` is a - s (a - a0): at s = 1/2 the mean of both logits."""
     decider = OWN_PAIR.bind_decider(AGENT)

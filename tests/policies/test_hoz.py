@@ -159,6 +159,7 @@ def reading_in(zones, goal=FRIDGE, cell=0):
     return read_of(see(TRACKER.init(knowledge), knowledge, cell), knowledge, goal)
 
 
+@pytest.mark.slow
 def test_permuted_relations_change_the_experience_and_nothing_else_of_the_graph():
     bank = [corridor(BOOK, CHAIR, FRIDGE)]
     zones, permuted = learn_zones(bank, NOTHING, 3), learn_permuted_zones(bank, NOTHING, 3)

@@ -104,6 +104,7 @@ def test_method_label_is_the_name_without_its_module(name, label):
     assert method_label(name) == label
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", params_by_tier(["BATCH", "WIDTH", "FINITE", "NOTE", "ACTION"], fast=["ACTION"], slow=["BATCH", "FINITE"])
 )

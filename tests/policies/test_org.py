@@ -73,6 +73,7 @@ def package_and_reference(num_layers, **mistake):
     return np.asarray(encoded), np.array(expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_layers", [1, 4])
 def test_experience_is_that_of_the_released_equations(num_layers):
     encoded, expected = package_and_reference(num_layers)

@@ -106,6 +106,7 @@ def test_initial_memory_is_zero_with_no_previous_action(org):
     assert NO_ACTION == NUM_ACTIONS  # one past the actions: its one-hot vector is zero
 
 
+@pytest.mark.slow
 def test_fresh_policy_is_close_to_uniform_with_a_rare_done():
     weights = init_params(SPEC, jax.random.key(0))
     memory = PolicyState(jnp.zeros(SIZES.hidden), jnp.int32(NO_ACTION))

@@ -189,6 +189,7 @@ def encode_experience(weight_kind, observation, layout_weights):
     return np.asarray(policy.pathways(PolicyInputs(observation, jnp.asarray(layout_weights))).experience)
 
 
+@pytest.mark.slow
 def test_relative_weights_enter_as_raw_weights_that_were_scaled():
     observation = with_detections(detections(SEEN, SEEN))
     raw_weights = np.tile(np.array([0.1, 0.3, 0.2], np.float32), (BATCH, 1))

@@ -66,6 +66,7 @@ def test_what_is_too_long_ago_is_forgotten():
     assert not any(follow(turns, 7))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", ["rooms", "apartments", "houses"])
 def test_exactly_the_repeated_poses_of_random_walks_are_told(world):
     """With 8 and 12 headings, 2 horizons and 1, and walks longer than what is remembered."""

@@ -139,6 +139,7 @@ def test_control_looks_down_walks_north_and_says_done_near_a_confirmed_goal():
     assert int(walk.tracker_state(-2).goal_sight) == GOAL_CONFIRMED
 
 
+@pytest.mark.slow
 def test_control_says_done_only_after_a_second_pose_confirms_the_goal():
     """At line 20 the book is 0.75 m away and in view at once."""
     walk = walk_corridor(make_start_state(20, NORTH), [choice_ahead(1)] * 60)
@@ -180,6 +181,7 @@ def test_no_step_is_a_decision_while_the_goal_is_on_the_map():
     assert bool(local_policy.is_decision_step(unmarked_state))
 
 
+@pytest.mark.slow
 def test_control_keeps_the_long_term_goal_for_25_actions():
     """In a room without an end the block stays worth exploring: the choice counts every 25 actions."""
     tracker_state = MapTracker().init(make_knowledge())._replace(search_horizon=jnp.int32(0))
@@ -195,6 +197,7 @@ def test_control_keeps_the_long_term_goal_for_25_actions():
 # The planner and the marks
 
 
+@pytest.mark.slow
 def test_planner_avoids_walls_of_the_map_alone():
     walk = walk_corridor(make_start_state(10, NORTH), [choice_ahead(10)] * 4)
     tracker_state = walk.tracker_state(-1)
@@ -224,6 +227,7 @@ def test_control_clears_a_goal_mark_after_three_failed_views():
     assert not int(state_after_third.cells[z + 1, x]) & book_bit
 
 
+@pytest.mark.slow
 def test_tracker_clears_a_mark_from_a_cell_only_once():
     """A mark that comes back, seen at another heading, stays after that, or the agent would turn to and fro."""
     walk = walk_corridor(make_start_state(4, NORTH, FRIDGE), [choice_ahead(3)] * 2)

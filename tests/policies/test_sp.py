@@ -164,6 +164,7 @@ def encode(view, mixing, layout_weights=(1.0, 1.0, 1.0)):
     return np.asarray(GRAPH_CONVOLUTION.encode(view, APPEARANCE, weights, jnp.asarray(mixing, jnp.float32)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("second_weight", "expected"), [(2.0, [25 / 36, 31 / (18 * 6**0.5), 4 / 9]), (-2.0, [0.0, 0.0, 0.0])]
 )
@@ -250,6 +251,7 @@ def test_layout_weights_multiply_the_experience():
     np.testing.assert_allclose(encode(view, MIXING, layout_weights), layout_weights * experience, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_fresh_graph_convolution_has_outputs_of_both_signs():
     """With a ReLU at the end some would be zero for all categories of this view, and could not learn otherwise."""
     spec = dataclasses.replace(SPEC, sizes=Sizes())

@@ -74,6 +74,7 @@ def test_the_map_agrees_with_the_room(walked):
         assert len(result) > len(set(cells[:, walk]))  # seen from afar
 
 
+@pytest.mark.slow
 def test_what_is_read_is_the_map_turned_with_the_agent(walked):
     _, memory, env, explored, _ = walked
     side = 2 * memory.reach + 1
@@ -217,6 +218,7 @@ def test_the_surroundings_enter_by_the_scene_alone_and_start_anew_with_an_episod
     np.testing.assert_array_equal(np.asarray(after.perception.spatial_map.position)[:2], 32)
 
 
+@pytest.mark.slow
 def test_a_policy_without_it_has_no_part_of_it():
     policy = bind(tiny.SPEC, tiny.random_params(0))
     assert policy.view.kernel.shape[0] == 2 * policy.row_format.view**2

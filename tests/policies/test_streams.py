@@ -148,6 +148,7 @@ def test_tde_of_streams_is_the_direct_stream_with_gate_and_spatial_memory(option
     assert np.std(effect) > 0.1
 
 
+@pytest.mark.slow
 def test_decision_without_either_stream_is_zero():
     decisions = random_decisions(make_spec("org"), seed=1)
     assert not decisions.neither.logits.any()
@@ -159,6 +160,7 @@ def test_decision_without_either_stream_is_zero():
 # Inputs of the streams
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("use_experience", "is_changed"), [(0.0, False), (1.0, True)])
 @pytest.mark.parametrize("method_name", ["org", "rgb", "support.methods:ATTENTIVE"])
 def test_detections_of_other_categories_reach_only_the_experience_stream(method_name, use_experience, is_changed):
@@ -198,6 +200,7 @@ def test_episode_without_experience_is_decided_by_the_direct_stream(seed):
     np.testing.assert_array_equal(decision.use_experience, np.zeros(BATCH_SIZE))
 
 
+@pytest.mark.slow
 def test_each_stream_updates_its_half_of_the_hidden_state_by_its_own_core():
     """The hidden states are those of two cells of Flax."""
     rng = np.random.default_rng(0)
@@ -219,6 +222,7 @@ def test_each_stream_updates_its_half_of_the_hidden_state_by_its_own_core():
         np.testing.assert_allclose(hidden[:, half], expected_hidden, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_initial_memory_of_streams_uses_experience():
     spec = make_spec("support.methods:ADAPTIVE")
     memory = bind(spec, tiny.random_params(0, spec)).initial_memory((2, 3))

@@ -150,6 +150,7 @@ def test_memory_retrieves_what_an_action_led_to():
     np.testing.assert_allclose(answer[:HIDDEN_SIZE], tentative_policy.state(hidden[18]), atol=0.3)
 
 
+@pytest.mark.slow
 def test_prediction_depends_on_the_actions_of_the_trials():
     hidden, actions = draw_episode(40)
     logits, _ = predict_along(hidden, actions)
@@ -159,6 +160,7 @@ def test_prediction_depends_on_the_actions_of_the_trials():
     assert change[1:].min() > 1e-3
 
 
+@pytest.mark.slow
 def test_no_gradient_passes_remembered_states():
     hidden, actions = draw_episode(12)
 
@@ -255,6 +257,7 @@ def test_agent_without_trials_decides_without_changes(agent_loop):
     np.testing.assert_allclose(decision.logits, plain_decision.logits, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_policy_without_inner_steps_is_replayed_in_parallel():
     policy = dataclasses.replace(AGENT_LOOP, inner_steps=0).bind(tiny.random_params(0, SPEC))
     assert policy.adaptation is None

@@ -75,6 +75,7 @@ def random_inputs(seed=0):
 # Tokens
 
 
+@pytest.mark.slow
 def test_encode_does_not_depend_on_the_order_of_categories():
     features, appearance, layout_weights = random_inputs()
     experience = compile_encode()(features, appearance, layout_weights)
@@ -120,6 +121,7 @@ def test_encode_ignores_categories_neither_detected_nor_sought():
     assert (np.abs(reweighted_experience - experience).max(axis=-1) > 1e-3).all()
 
 
+@pytest.mark.slow
 def test_encode_masks_surplus_tokens():
     features, appearance, layout_weights = random_inputs()
     assert (features.visible + features.goal > 0).sum(axis=-1).min() < NUM_CATEGORIES

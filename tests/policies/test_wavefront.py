@@ -50,7 +50,8 @@ def random_maps(count, size=SIZE):
     return targets, passable, generator.integers(0, size, (count, 2)).astype(np.int32)
 
 
-@pytest.mark.parametrize("maps", [50, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("maps", [50, 1000])
 def test_ways_are_as_long_as_those_of_a_queue(maps):
     targets, passable, start = random_maps(maps)
     lengths = np.asarray(find_ways(targets, passable, start).length)
@@ -123,6 +124,7 @@ def test_a_drawn_way_takes_the_gap():
     np.testing.assert_array_equal(way.length, [6, -1])
 
 
+@pytest.mark.slow
 @given(st.integers(0, SIZE - 1), st.integers(0, SIZE - 1))
 def test_a_cell_spreads_to_its_eight_neighbours(z, x):
     cells = np.zeros((SIZE, SIZE), bool)

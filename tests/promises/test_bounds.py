@@ -57,6 +57,7 @@ def test_max_decompressed_size_grows_with_the_file():
     assert [max_decompressed_size(size) // MIB for size in (0, MIB, 2 * MIB, 100 * MIB)] == [64, 64, 100, 5000]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("content", "limit"),
     [

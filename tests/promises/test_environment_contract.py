@@ -15,6 +15,7 @@ from jaxnav.scenes.task import Task
 BANK = compile_bank([generate_room("train", i, 0) for i in range(4)], Task())  # one of each type
 
 
+@pytest.mark.slow
 def test_generated_rooms_satisfy_the_environment_contract():
     check_environment(*build_environment(BANK, {}, 5))
 
@@ -56,6 +57,7 @@ class Lies(ObjectNav):
         return observation, after, reward, terminated, truncated, info
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("broken", "promise"),
     [

@@ -104,6 +104,7 @@ def test_read_log_rows_refuses_a_log_of_0_1(run_of_0_1):
     assert str(refused.value).endswith(REFUSED)
 
 
+@pytest.mark.slow
 def test_restore_refuses_a_checkpoint_of_0_1(tmp_path, monkeypatch):
     """Their metadata has no digest."""
     manifest = make_manifest({})

@@ -53,6 +53,7 @@ def test_checkpoints_are_stored_in_a_run_directory_of_any_name(name, tmp_path, m
     assert os.listdir(run_dir / "checkpoints") == ["1"]
 
 
+@pytest.mark.slow
 def test_two_names_that_match_as_patterns_stay_apart(tmp_path):
     for value, name in enumerate(("a*", "ab", "a[b]", "a?")):
         checkpoint.save_checkpoint(tmp_path / name, 1 + value, STATE, MANIFEST)
@@ -62,6 +63,7 @@ def test_two_names_that_match_as_patterns_stay_apart(tmp_path):
         assert restored.step == 1 + value
 
 
+@pytest.mark.slow
 def test_save_checkpoint_refuses_a_temporary_folder_with_a_hostile_name(tmp_path, monkeypatch):
     (tmp_path / "t[1]").mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "t[1]"))
@@ -70,6 +72,7 @@ def test_save_checkpoint_refuses_a_temporary_folder_with_a_hostile_name(tmp_path
         checkpoint.save_checkpoint(tmp_path / "exp[1]", 1, STATE, MANIFEST)
 
 
+@pytest.mark.slow
 def test_first_checkpoint_is_read_back(tmp_path, monkeypatch):
     digests = checkpoint.array_digests(STATE)
     wrong_digests = digests | dict.fromkeys(digests, "0")

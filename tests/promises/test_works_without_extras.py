@@ -47,6 +47,7 @@ def test_every_name_and_help_works_without_extras(tmp_path):
 DRAWING_COMMANDS = ["episode run", "report run", "scenes show rooms", "study study_rooms"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", params_by_tier(DRAWING_COMMANDS, fast=DRAWING_COMMANDS[:1], slow=DRAWING_COMMANDS))
 def test_drawing_command_is_refused_without_extras(tmp_path, command):
     script = f"from jaxnav.__main__ import main\nsys.exit(main({command.split()}))"

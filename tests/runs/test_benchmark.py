@@ -83,6 +83,7 @@ def test_scores_follow_from_the_stored_episodes(tiny_benchmark, tmp_path):
         assert row["sr@20"]["mean"] == pytest.approx(100.0 * (success * (length <= 20)).mean())
 
 
+@pytest.mark.slow
 def test_homes_that_differ_from_the_manifest_are_refused(tiny_benchmark):
     checksum = load_benchmark("tiny").tracks[0].checksums[1]
     tiny_benchmark.write_text(tiny_benchmark.read_text().replace(checksum, "0" * 16))

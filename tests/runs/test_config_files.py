@@ -189,6 +189,7 @@ def test_apply_yaml_names_the_new_name_of_a_renamed_key(tmp_path):
     assert apply_yaml(Nested(), path).base == RunConfig(method_sizes={"relation_layers": 2})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "place"),
     [

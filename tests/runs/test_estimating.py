@@ -104,6 +104,7 @@ def test_with_inner_steps_refuses_more_steps_than_the_method_adapts(drawn_run):
     assert adaptive.make_agent_loop(world).inner_steps is None
 
 
+@pytest.mark.slow
 def test_semexp_refuses_scenes_larger_than_its_map_at_every_entry_point(drawn_run):
     """A map of 12 lines holds a cell and the 11 of a view."""
     world = compile_evaluation_world(drawn_run.config, "val", None, None, Console(quiet=True))
@@ -124,6 +125,7 @@ def test_semexp_refuses_scenes_larger_than_its_map_at_every_entry_point(drawn_ru
             act()
 
 
+@pytest.mark.slow
 def test_pooled_prior_sums_the_counts_of_all_rooms(config):
     world = compile_training_world(config, Console(quiet=True))
     pooled = dataclasses.replace(config, layout=dataclasses.replace(config.layout, prior="pooled"))

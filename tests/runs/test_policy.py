@@ -149,6 +149,7 @@ def test_handover_policy_switches_as_in_the_evaluation(drawn_run, world, setting
     assert 0 < np.mean(has_switched) < 1
 
 
+@pytest.mark.slow
 def test_loaded_policy_actions_depend_on_epsilon_and_key(drawn_run, world):
     policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES_DIR / "layout-1")
     bank = world.banks[0]
@@ -189,6 +190,7 @@ def stack(trees):
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["layout-0", "baseline-0"])
 def test_vmapped_observations_equal_single_steps(drawn_run, world, name):
     policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES_DIR / name)
@@ -200,6 +202,7 @@ def test_vmapped_observations_equal_single_steps(drawn_run, world, name):
     chex.assert_trees_all_close(batched, singles, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_vmapped_policies_equal_single_policies(drawn_run, world):
     policy_dirs = [drawn_run.config.run_dir / POLICIES_DIR / f"layout-{seed}" for seed in range(2)]
     policies = [jaxnav.load_policy(policy_dir) for policy_dir in policy_dirs]

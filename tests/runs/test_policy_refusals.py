@@ -66,6 +66,7 @@ def test_arguments_that_are_no_path_are_named(function, argument):
         function(argument)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("subject", [None, 3, b"runs/rooms", ["runs/rooms"]])
 def test_subjects_that_are_no_agent_are_named(subject):
     with pytest.raises(InputError, match="is no agent; give an object with init and act or with predict, a function"):
@@ -111,6 +112,7 @@ def test_load_policy_refuses_exports_of_other_code(export, changes, problem):
     assert any(advice in message for advice in ("install or fix its package", "choose one of", "train the run again"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "learned", "problem"),
     [

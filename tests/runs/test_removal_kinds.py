@@ -103,6 +103,7 @@ def test_counterfactual_memory_changes_only_rows_with_counterfactual_logits(run,
     assert (outcome_of(factual, "tde").length != outcome_of(own, "tde").length).any()
 
 
+@pytest.mark.slow
 def test_loaded_policy_carries_both_memories(run):
     policy = jaxnav.load_policy(run.config.run_dir / "policies" / "layout-0")
     world = compile_evaluation_world(run.config, "val", None, None, Console(quiet=True))

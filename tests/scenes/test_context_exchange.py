@@ -147,6 +147,7 @@ def test_cycles_are_those_of_the_permutation(seed):
     np.testing.assert_array_equal(apply_cycles(list_cycles(permutation), 9), permutation)
 
 
+@pytest.mark.slow
 def test_random_exchanges_reach_every_permutation_within_the_groups():
     # Two small goals and three large categories: 2! x 3! = 12 permutations. After 250 draws, one is missing with a
     # chance below 12 x (11 / 12)^250 < 1e-8.

@@ -87,6 +87,7 @@ def permutation_test(
     return (1 + (by_chance >= squared_difference(in_first)).sum()) / 401
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", ["rooms", "apartments", "houses"])
 def test_shift_scenes_exchanges_places_in_every_scene(world):
     task = WORLDS[world].task

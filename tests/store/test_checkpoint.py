@@ -68,6 +68,7 @@ def restore_latest(
     return restore_result.state, restore_result.step
 
 
+@pytest.mark.slow
 def test_checkpoint_restores_state_types_keys_and_step(tmp_path):
     saved_state = make_state(7)
     assert not np.array_equal(saved_state.params["dense"]["kernel"], make_state(8).params["dense"]["kernel"])
@@ -87,6 +88,7 @@ def test_restore_returns_none_without_checkpoints(tmp_path):
     assert not (tmp_path / "none").exists()
 
 
+@pytest.mark.slow
 def test_checkpoints_keep_the_latest_two_steps(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run_dir = Path("run")  # Orbax itself refuses relative paths
@@ -97,6 +99,7 @@ def test_checkpoints_keep_the_latest_two_steps(tmp_path, monkeypatch):
     assert (restored_step, loaded_state.step) == (10, 10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("saved_step", [4, 5])
 def test_checkpoint_refuses_a_step_that_is_not_newer(tmp_path, saved_step):
     checkpoint.save_checkpoint(tmp_path, 5, make_state(5), MANIFEST)
@@ -197,9 +200,8 @@ for step in range(1, 10**6):
 """
 
 
-@pytest.mark.parametrize(
-    "kill_delay", [0.0, *(pytest.param(seconds, marks=pytest.mark.slow) for seconds in (0.01, 0.03, 0.1))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kill_delay", [0.0, 0.01, 0.03, 0.1])
 def test_kill_during_save_leaves_a_whole_checkpoint(tmp_path, kill_delay):
     command = [sys.executable, "-c", ENDLESS_SAVES, str(tmp_path)]
 
@@ -228,6 +230,7 @@ def test_kill_during_save_leaves_a_whole_checkpoint(tmp_path, kill_delay):
 # A full disk
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "error", [OSError(errno.ENOSPC, "No space left on device"), ValueError("RESOURCE_EXHAUSTED: Failed writing")]
 )

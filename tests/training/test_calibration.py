@@ -116,6 +116,7 @@ def choose(counts, strengths=STRENGTHS, reductions=("mean_visible", "sum"), key=
     return calibrate(ENV, PARAMS, counts, SETTING, key, strengths, reductions, WALKS)
 
 
+@pytest.mark.slow
 def test_early_and_late_gap_are_those_of_a_plain_loop(counts, by_hand):
     assert len({round(early, 3) for early, _ in by_hand.values()}) == len(PAIRS)
     result = choose(counts, (6.0,), ("sum",))  # a single pair is not left out, however far

@@ -28,6 +28,7 @@ from jaxnav.scenes.task import DONE
 COIN = pytest.mark.parametrize("coin", [False, True])
 
 
+@pytest.mark.slow
 def test_the_rollout_holds_every_case():
     """Without which the comparisons below would say little."""
     run = rolled(False)
@@ -42,6 +43,7 @@ def test_the_rollout_holds_every_case():
     assert t.use_direct is None
 
 
+@pytest.mark.slow
 @COIN
 def test_weights_values_and_probabilities_are_those_of_a_plain_loop(coin):
     stored, plain = rolled(coin).transitions, retrace(coin)

@@ -55,6 +55,7 @@ def actions():
     return jnp.asarray(np.random.default_rng(1).integers(0, 6, (NUM_STEPS, BATCH_SIZE)), jnp.int32)
 
 
+@pytest.mark.slow
 def test_own_memory_equals_the_factual_one_where_scene_and_goal_are_always_zero(policy, actions):
     pathways = do(random_pathways(policy, np.random.default_rng(0)), scene=0.0, goal=0.0)
     for decision in decide_in_turn(policy, pathways, actions):
@@ -179,7 +180,8 @@ def test_both_kinds_of_replay_agree_in_decisions_and_gradients(method_name, kind
     assert not reached & {"view", "sought", "critic"}
 
 
-@pytest.mark.parametrize("method_name", ["org", pytest.param("support.methods:ATTENTIVE", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("method_name", ["org", "support.methods:ATTENTIVE"])
 def test_replay_repeats_the_memory_that_acting_carries(method_name):
     agent_loop, weights, rollouts, last_agent = collect_two_rollouts(method_name)
     memories = [rollouts[0].initial_memory, rollouts[1].initial_memory, last_agent.memory]
@@ -191,6 +193,7 @@ def test_replay_repeats_the_memory_that_acting_carries(method_name):
     assert np.abs(memories[-1].counterfactual_hidden - memories[-1].hidden).max() > 0.1
 
 
+@pytest.mark.slow
 def test_acting_and_factual_decisions_do_not_depend_on_the_kind_of_memory():
     results = []
     for kind in ("factual", "own"):

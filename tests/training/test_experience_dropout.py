@@ -79,6 +79,7 @@ def test_dropout_draws_whole_episodes():
     assert flags[is_first].mean() == pytest.approx(EXPERIENCE_PROB, abs=0.09)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method_name", HOSTS)
 def test_replay_recomputes_log_probs_and_values(method_name):
     weights, rollouts = collect_rollouts(method_name)

@@ -32,6 +32,7 @@ def count(poses):
     return counts
 
 
+@pytest.mark.slow
 def test_walks_that_see_everything_count_every_pose_once():
     result = run(ENV, PARAMS, jax.random.key(0), 128, 200)
     assert result.poses == len(PRESENCE)  # on average 70 visits of every pose
@@ -40,6 +41,7 @@ def test_walks_that_see_everything_count_every_pose_once():
     assert result.counts.max() > 10
 
 
+@pytest.mark.slow
 def test_short_walks_count_what_they_pass():
     # The draws of the module, then the walks in NumPy.
     key, walks, steps = jax.random.key(0), 5, 4
@@ -60,6 +62,7 @@ def test_estimators_with_a_gate_and_presence_take_the_prior_from_poses():
         np.testing.assert_array_equal(result.prior_counts, result.counts)
 
 
+@pytest.mark.slow
 def test_the_paper_counts_every_view_and_every_instance():
     """Each view of each walk adds its counts n_j to the rows of the categories that it shows."""
     task = dataclasses.replace(tiny.BANK.task, instance_counts=True)

@@ -87,6 +87,7 @@ def test_two_chunks_beside_another_seed_are_one_chunk_alone_bit_for_bit(first, w
         assert logged[name] == pytest.approx(sum(part[name] for part in parts) / 2)
 
 
+@pytest.mark.slow
 def test_the_best_policy_is_kept_and_a_later_one_among_equals(first):
     keep = jax.jit(LEARNER.keep_if_best)
     state = tiny.leaves_at(first[0], 0)

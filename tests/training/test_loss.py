@@ -207,6 +207,7 @@ def loss_parts_in_numpy(factual, counterfactual, transitions, advantage):
     return {name: part / advantage.size for name, part in parts.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distil", [False, True])
 def test_ppo_loss_equals_the_clipped_loss_in_numpy(distil):
     run = rolled(True)
@@ -235,6 +236,7 @@ def test_policy_loss_of_the_acting_policy_is_zero():
     assert parts["policy_loss"] == pytest.approx(0, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_ppo_loss_adds_the_auxiliary_loss_of_the_method():
     run = rolled(True)
     metrics = {"extra_metric": jnp.float32(3)}
@@ -255,6 +257,7 @@ DISTIL_ONLY = {
 }
 
 
+@pytest.mark.slow
 def test_distillation_gradient_reaches_only_the_counterfactual_branch():
     # Advantages of zero: the policy loss has no gradient either.
     no_advantage = jnp.zeros((LENGTH, ENVS))

@@ -51,6 +51,7 @@ def test_an_exchange_is_between_pairs_of_the_present(seed, present):
     assert moved.sum() == sum(present) // 2 * 2  # one of an odd number stays
 
 
+@pytest.mark.slow
 def test_categories_exchange_with_those_seen_about_as_often():
     """The distance in rank is under that of a pair at random, (K + 1) / 3, and over that of fixed neighbours, 1."""
     often, present = jnp.arange(24.0)[::-1], jnp.ones(24, bool)
@@ -70,6 +71,7 @@ def test_chances_by_hand():
 REGRESSION = jax.jit(module._fit_log_odds, static_argnums=3)
 
 
+@pytest.mark.slow
 def test_the_regression_finds_the_odds_and_is_calibrated():
     """Pairs seen independently, in the other layout with exchanged shares: the odds are known, ln of the odds ratio."""
     generator, walks, pairs = np.random.default_rng(0), 4000, 36
@@ -89,6 +91,7 @@ def test_the_regression_finds_the_odds_and_is_calibrated():
         assert other[inside].mean() == pytest.approx(gaps[inside].mean(), abs=0.07)
 
 
+@pytest.mark.slow
 def test_nothing_is_learned_where_layouts_are_alike():
     """Negative control: both halves hold the same walks."""
     pairs = jnp.tile(jnp.asarray(np.random.default_rng(0).random((200, 36)) < 0.3), (2, 1))

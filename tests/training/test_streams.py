@@ -78,6 +78,7 @@ def collect_rollouts(method_name):
 # The coin: whether experience has a part in an episode
 
 
+@pytest.mark.slow
 def test_experience_coin_is_constant_within_an_episode():
     _, rollouts = collect_rollouts("org")
     coins = np.concatenate([rollout.transitions.use_experience for rollout in rollouts])
@@ -250,6 +251,7 @@ def test_replay_of_streams_recomputes_log_probs_and_values(method_name):
         np.testing.assert_allclose(decisions.value, transitions.value, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method_name", HOST_PARAMS)
 def test_gradient_reaches_the_direct_stream_alone_or_the_experience_stream(method_name):
     """The direct stream learns where it acts alone, the experience stream where it adds to that."""

@@ -227,6 +227,7 @@ def count_table_differences(scene: Scene, guide: Guide, task: Task, stride: int 
     return +differences
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", TASKS)
 @pytest.mark.parametrize(
     ("source", "stride"),
@@ -258,6 +259,7 @@ def test_tables_of_a_real_apartment_equal_the_twin(world):
     assert count_table_differences(scene, Guide(scene, task), task, stride=7) == collections.Counter()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", TASKS)
 @pytest.mark.parametrize(
     ("source", "stride"),

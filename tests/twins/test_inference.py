@@ -254,6 +254,7 @@ def test_decisions_of_the_setting_paper_are_the_twins(strength):
     assert max(weights) < 1e-6
 
 
+@pytest.mark.slow
 def test_a_twin_that_counts_presence_is_noticed(monkeypatch):
     monkeypatch.setattr(agent, "unpack_counts", lambda row, size: np.minimum(unpack_counts(row, size), 1.0))
     setting = dataclasses.replace(ESTIMATORS["paper"], strength=5.0)
@@ -371,6 +372,7 @@ for _method in ("eotp", "hoz", "semexp", "sp", "tpn", "vtnet"):
     SLOW_MISTAKES[f"{_method}: w by a factor"] = (_method, "fused", weights_times(0.9, _method))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "mistake", [*MISTAKES, *(pytest.param(mistake, marks=pytest.mark.exhaustive) for mistake in SLOW_MISTAKES)]
 )

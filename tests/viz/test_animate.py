@@ -39,6 +39,7 @@ def test_animation_is_shown_in_notebooks_and_saved(tmp_path):
     assert (tmp_path / "a.gif").read_bytes() == animation.data
 
 
+@pytest.mark.slow
 def test_rendered_states_of_any_agent_are_animated():
     env, params = jaxnav.make("rooms", split="val")
     _, state = env.reset(jax.random.key(0), params)

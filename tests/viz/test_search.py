@@ -116,6 +116,7 @@ def test_snapshot_predicts_the_walk_while_nothing_new_is_seen(corridor_walk):
     np.testing.assert_array_equal(take_snapshot(episode, 0).predicted_cells[: NUM_STEPS - 1], positions[1:])
 
 
+@pytest.mark.slow
 def test_projection_puts_visited_cells_at_the_places_of_the_agent(corridor_walk):
     episode, search_states = corridor_walk
     projection = MapProjection(episode, take_snapshot(episode, NUM_STEPS - 1))

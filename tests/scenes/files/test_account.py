@@ -156,6 +156,7 @@ def test_identity_of_scenes_does_not_depend_on_the_header(tmp_path):
 # Random and real inputs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene_format", FORMATS, ids=lambda form: " ".join((form.name, *form.options[:1])))
 def test_account_of_mutated_inputs_adds_up(tmp_path, scene_format: Format):
     draw = random.Random(0)

@@ -85,6 +85,7 @@ def test_ego_centric_view_along_a_diagonal():
     assert picture[:4] == ["?????.?????", "????...????", "???#....???", "??...#...??"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rules", [ROOMS, APARTMENTS, HOUSES])
 def test_ego_centric_view_of_a_mirrored_room_is_mirrored(rules):
     # With 12 headings, many offsets are halves: the cell 1 ahead at 30 degrees lies half a cell to the right.

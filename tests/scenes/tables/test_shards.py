@@ -104,6 +104,7 @@ def test_shards_without_a_goal_are_left_out_or_refused_altogether(tmp_path):
 # Folders of shards
 
 
+@pytest.mark.slow
 def test_two_workers_write_identical_shards_and_report_progress(tmp_path):
     reports = []
     by_one_worker = compile_corridors(tmp_path / "one")

@@ -97,6 +97,7 @@ def test_read_habitat_refuses_a_missing_file(tmp_path):
         list(read_habitat(tmp_path / "none.json.gz", "val"))
 
 
+@pytest.mark.slow
 @given(mutated(EPISODES), st.booleans())
 def test_read_habitat_reads_or_refuses_mutated_episodes(tmp_path_factory, file_content, use_maps):
     base_folder = tmp_path_factory.getbasetemp()

@@ -5,6 +5,7 @@ import json
 from typing import Any, NamedTuple
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.importer_inputs.procthor import build, door, item, point
@@ -107,6 +108,7 @@ def offsets_from_box(points: np.ndarray, box: tuple[float, ...]) -> np.ndarray:
     return np.maximum(0, np.maximum(low_corner - points, points - high_corner))
 
 
+@pytest.mark.slow
 @given(random_houses())
 def test_read_procthor_imports_random_houses_by_the_rules(tmp_path_factory, house):
     house_file = tmp_path_factory.mktemp("random") / "house.json"

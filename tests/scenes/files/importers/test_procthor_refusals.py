@@ -151,6 +151,7 @@ def test_read_procthor_refuses_bad_asset_databases_naming_the_field(tmp_path, re
     assert_message_names(error.value, str(tmp_path / "assets.json"), f"{field_name} ")
 
 
+@pytest.mark.slow
 def test_read_procthor_imports_or_refuses_mutated_houses(tmp_path):
     outcomes = collections.Counter()
     house_file = tmp_path / "houses.jsonl"
