@@ -52,7 +52,7 @@ lint: $(READY)
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/lint-imports --no-cache
-	$(BIN)/pyright --pythonpath $(BIN)/python
+	$(BIN)/pyright --threads 2 --pythonpath $(BIN)/python
 
 # Every warning, such as a broken link, is an error, but mkdocs does not count warnings that `--quiet` hides.
 docs: $(READY)
