@@ -449,12 +449,13 @@ def test_removal_keeps_value_and_recovers_cost(tmp_path):
     value = read_lines(text.split("### Value and cost of experience")[1])["its value (or cost)"]
     assert value == ["+6.0 [-]"] * 3 + ["-4.0 [-]"] * 3
 
-    # Weights, then changes at both shifts and over the mixture, then value kept and cost recovered.
-    weights, *cells = read_lines(text.split("### Every removal")[1])["TDE"]
-    assert weights == "1.00, 1.00"
-    assert cells[:6] == ["-4.0 [-]"] * 3 + ["+3.0 [-]"] * 3
-    assert cells[6:9] == ["-"] * 3  # there is no row over the mixture
-    assert [cell.split()[0] for cell in cells[9:]] == ["33", "33", "75", "75"]
+    # One table per measure: weights, changes at both shifts and over the mixture, value kept and cost recovered.
+    text_of_removals = text.split("### Every removal")[1]
+    for title, shares in (("SR within 40 actions", ["33", "75"]), ("SR", ["33", "75"]), ("SPL", [])):
+        weights, *cells = read_lines(text_of_removals.split(f"**{title}**")[1])["TDE"]
+        assert weights == "1.00, 1.00"
+        assert cells[:3] == ["-4.0 [-]", "+3.0 [-]", "-"]  # there is no row over the mixture
+        assert [cell.split()[0] for cell in cells[3:]] == shares
 
 
 def test_a_world_may_be_measured_on_one_split_alone(tmp_path):
