@@ -27,7 +27,7 @@ class TrainingSetup(NamedTuple):
 
     Attributes:
       config: settings of the run.
-      world: training scenes.
+      compiled_world: training scenes.
       params: of the environment, with the first bank of scenes.
       exploration: random walks that the layout priors are counted from.
       estimator_config: settings of the layout estimator.
@@ -36,7 +36,7 @@ class TrainingSetup(NamedTuple):
     """
 
     config: RunConfig
-    world: CompiledWorld
+    compiled_world: CompiledWorld
     params: EnvParams
     exploration: Exploration
     estimator_config: EstimatorConfig
@@ -66,22 +66,22 @@ def set_up_training(config: RunConfig, mesh: Mesh | None = None, explore: bool =
       mesh: of devices; None for one device.
       explore: walk through the scenes for the layout priors; otherwise all pairs of categories are equally likely.
     """
-    world = compile_training_world(config, PlainConsole(quiet=True))
+    compiled_world = compile_training_world(config, PlainConsole(quiet=True))
     estimator_config = ESTIMATORS[config.layout.setting]
 
     # Without exploration all counts are zero.
     if explore:
-        exploration = explore_world(config, world)
+        exploration = explore_world(config, compiled_world)
     else:
-        num_categories = len(world.env.categories)
+        num_categories = len(compiled_world.env.categories)
         counts = jnp.zeros((NUM_PRIORS, num_categories, num_categories))
         exploration = Exploration(counts, counts, jnp.int32(0), jnp.int32(0))
 
     # The trainer compiles each arm on its first update.
-    knowledge = learn_knowledge(config, world, exploration, estimator_config)
-    trainer = make_trainer(config, world.env, estimator_config, knowledge, mesh)
-    env_params = world.make_env_params(0)
-    return TrainingSetup(config, world, env_params, exploration, estimator_config, knowledge, trainer)
+    knowledge = learn_knowledge(config, compiled_world, exploration, estimator_config)
+    trainer = make_trainer(config, compiled_world.env, estimator_config, knowledge, mesh)
+    env_params = compiled_world.make_env_params(0)
+    return TrainingSetup(config, compiled_world, env_params, exploration, estimator_config, knowledge, trainer)
 
 
 def make_training_call(trainer: Trainer, states: Any, params: EnvParams) -> Callable[[], None]:

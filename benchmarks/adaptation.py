@@ -86,14 +86,14 @@ def stack_outcomes(results: Results, row_index: int) -> np.ndarray:
 def percent_falling(run: jaxnav.Run) -> list[float]:
     """Return the percentage of windows whose loss falls, for each seed."""
     policies = run.policies()
-    world = compile_evaluation_world(run.config, "val", None, None, PlainConsole(quiet=True))
-    agent_loop = dataclasses.replace(policies.make_agent_loop(world), estimator_config=None)
+    compiled_world = compile_evaluation_world(run.config, "val", None, None, PlainConsole(quiet=True))
+    agent_loop = dataclasses.replace(policies.make_agent_loop(compiled_world), estimator_config=None)
     arm_params = policies.arm_params("baseline")
 
     percentages = []
     for seed in range(policies.num_seeds):
         weights = jax.tree.map(operator.itemgetter(seed), arm_params)
-        window_losses = measure_windows(agent_loop, weights, policies.knowledge, world.make_env_params(0))
+        window_losses = measure_windows(agent_loop, weights, policies.knowledge, compiled_world.make_env_params(0))
         is_full, loss_before, loss_after = map(np.asarray, window_losses)
         percentages.append(round(100.0 * float((loss_after < loss_before)[is_full].mean()), 2))
     return percentages

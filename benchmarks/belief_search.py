@@ -93,8 +93,8 @@ def main(
             config = run.config
             if has_perfect_detector:
                 config = dataclasses.replace(config, detector=PERFECT_DETECTOR)
-            world = compile_evaluation_world(config, split, None, shift, console, shift_by=shift_by)
-            result = measure_run(policies, world, num_episodes, row_names, has_ablations)
+            compiled_world = compile_evaluation_world(config, split, None, shift, console, shift_by=shift_by)
+            result = measure_run(policies, compiled_world, num_episodes, row_names, has_ablations)
             result |= {"run": Path(run_dir).name, "method": run.config.method, "shift": shift}
             print(format_table(result), file=sys.stderr, flush=True)
             results.append(result)
@@ -104,26 +104,26 @@ def main(
 
 
 def measure_run(
-    policies: Policies, world: CompiledWorld, num_episodes: int, row_names: Sequence[str], has_ablations: bool
+    policies: Policies, compiled_world: CompiledWorld, num_episodes: int, row_names: Sequence[str], has_ablations: bool
 ) -> dict[str, Any]:
     """Measure rows of a run in one world.
 
     Args:
       policies: policies of the arm `layout`, one for each fit.
-      world: compiled scenes.
+      compiled_world: compiled scenes.
       num_episodes: number of episodes.
       row_names: rows to measure, among `ROW_NAMES`; `layout` is always measured.
       has_ablations: whether the search without some of its parts is measured too.
     """
     layout_row = BELIEF_ROWS["layout"]
-    evaluator = Evaluator(policies.make_agent_loop(world), has_controls=False)
+    evaluator = Evaluator(policies.make_agent_loop(compiled_world), has_controls=False)
     metrics: dict[str, Metrics] = {}
 
     # The nearest frontier does not depend on the fit.
     if "nearest" in row_names:
         nearest_policies = with_control(policies, use_nearest_frontier=True)
         nearest_policies = nearest_policies._replace(params=jax.tree.map(lambda leaf: leaf[:1], policies.params))
-        nearest_metrics, _ = measure_rows({"nearest": layout_row}, nearest_policies, world, num_episodes)
+        nearest_metrics, _ = measure_rows({"nearest": layout_row}, nearest_policies, compiled_world, num_episodes)
         metrics["nearest"] = {}
         for metric, values in nearest_metrics["nearest"].items():
             metrics["nearest"][metric] = np.repeat(values, policies.num_seeds, axis=0)
@@ -131,17 +131,17 @@ def measure_run(
     # Rows of other parameters share the compilation.
     if "flat" in row_names:
         flat_policies = with_zeros(policies, "places", "method")
-        metrics |= measure_rows({"flat": layout_row}, flat_policies, world, num_episodes, evaluator)[0]
+        metrics |= measure_rows({"flat": layout_row}, flat_policies, compiled_world, num_episodes, evaluator)[0]
     belief_rows = {name: row for name, row in BELIEF_ROWS.items() if name == "layout" or name in row_names}
-    belief_metrics, clusters = measure_rows(belief_rows, policies, world, num_episodes, evaluator)
+    belief_metrics, clusters = measure_rows(belief_rows, policies, compiled_world, num_episodes, evaluator)
     metrics |= belief_metrics
     pairs = [pair for pair in PAIRS if set(pair) <= set(metrics)]
     if has_ablations:
         for name, ablated_policies in ablate(policies).items():
-            metrics |= measure_rows({name: layout_row}, ablated_policies, world, num_episodes, evaluator)[0]
+            metrics |= measure_rows({name: layout_row}, ablated_policies, compiled_world, num_episodes, evaluator)[0]
             pairs.append(("layout", name))
         name = "plan for every action"
-        metrics |= measure_rows({name: layout_row}, with_control(policies, interval=1), world, num_episodes)[0]
+        metrics |= measure_rows({name: layout_row}, with_control(policies, interval=1), compiled_world, num_episodes)[0]
         pairs.append(("layout", name))
     return summarize(metrics, clusters, pairs)
 
@@ -149,12 +149,12 @@ def measure_run(
 def measure_rows(
     rows: Mapping[str, EvaluationRow],
     policies: Policies,
-    world: CompiledWorld,
+    compiled_world: CompiledWorld,
     num_episodes: int,
     evaluator: Evaluator | None = None,
 ) -> tuple[dict[str, Metrics], Clusters]:
     """Run rows by name; returns their metrics in percent, and the clusters of the episodes."""
-    episode_lists, outcome, _ = evaluate_rows(list(rows.values()), policies, world, num_episodes, 0, evaluator)
+    episode_lists, outcome, _ = evaluate_rows(list(rows.values()), policies, compiled_world, num_episodes, 0, evaluator)
     episodes = join_episode_lists(episode_lists)
     metrics = episode_metrics(outcome, episodes.best_length, BUDGETS)
     metrics_by_row = {}

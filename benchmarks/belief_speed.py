@@ -44,10 +44,10 @@ def main(num_episodes: int) -> None:
     config, belief_policies = load_policy_as_run("houses-belief")
     belief_policies = belief_policies.with_estimator("surprise")
     _, org_policies = load_policy_as_run("houses-org")
-    world = compile_evaluation_world(config, "val", None, 0.0, PlainConsole(stderr=True))
+    compiled_world = compile_evaluation_world(config, "val", None, 0.0, PlainConsole(stderr=True))
     calls = {
-        "belief": make_steps_call(belief_policies, world, num_episodes),
-        "org": make_steps_call(org_policies, world, num_episodes),
+        "belief": make_steps_call(belief_policies, compiled_world, num_episodes),
+        "org": make_steps_call(org_policies, compiled_world, num_episodes),
     }
     step_times = time_in_turns(calls, TURNS)
     num_steps = num_episodes * NUM_STEPS
@@ -63,11 +63,11 @@ def main(num_episodes: int) -> None:
     print_report(report)
 
 
-def make_steps_call(policies: Policies, world: CompiledWorld, num_episodes: int) -> Callable[[], Any]:
+def make_steps_call(policies: Policies, compiled_world: CompiledWorld, num_episodes: int) -> Callable[[], Any]:
     """Make a call that runs parallel episodes from their start, with sTDE."""
-    agent_loop = policies.make_agent_loop(world)
-    env_params = world.make_env_params(0)
-    episodes = draw_episode_lists(world, num_episodes, 0)[0]
+    agent_loop = policies.make_agent_loop(compiled_world)
+    env_params = compiled_world.make_env_params(0)
+    episodes = draw_episode_lists(compiled_world, num_episodes, 0)[0]
     grid = inference_grid([table_row("stde", 0.0, "paper", "argmax")], policies.arms, policies.num_seeds)
     config = jax.tree.map(lambda leaf: leaf[0], grid)
     policy = agent_loop.bind_decider(jax.tree.map(lambda leaf: leaf[0], policies.params))

@@ -81,7 +81,7 @@ def make_calls() -> Iterator[tuple[str, Callable[[], Any]]]:
     """Yield name and call of every entry; each is prepared when its turn comes."""
     config = dataclasses.replace(RunConfig(), chunk=CHUNK, seeds=1)
     setup = set_up_training(config, explore=False)
-    env = setup.world.env
+    env = setup.compiled_world.env
     params = setup.params
     estimator_config = setup.estimator_config
     knowledge = setup.knowledge
@@ -112,7 +112,7 @@ def make_calls() -> Iterator[tuple[str, Callable[[], Any]]]:
     weights = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), init_params(spec, key))
     rows = [table_row("layout", None, None, "sample"), table_row("stde", 0.5, "residual", "sample")]
     grid = inference_grid(rows, config.arms, 1)
-    episodes = draw_episodes(setup.world.banks[0])
+    episodes = draw_episodes(setup.compiled_world.banks[0])
     yield "evaluate", partial(Evaluator(agent_loop), grid, weights, [(episodes, params)], knowledge, key)
     first_cell = jax.tree.map(lambda leaf: leaf[0], grid)
     first_weights = jax.tree.map(lambda leaf: leaf[0], weights)

@@ -48,7 +48,7 @@ def measure_point(num_envs: int) -> dict:
     # Speed of single chunks.
     setup = set_up_training(config)
     mesh = accelerator_mesh(config)
-    trainer = make_trainer(config, setup.world.env, setup.estimator_config, setup.knowledge, mesh)
+    trainer = make_trainer(config, setup.compiled_world.env, setup.estimator_config, setup.knowledge, mesh)
     call = make_training_call(trainer, trainer.init(setup.params), setup.params)
     update_times = time_in_turns({"chunk": call}, turns=3)["chunk"]
     rate = steps_per_second(update_times, config.chunk * config.steps_per_update)

@@ -57,7 +57,7 @@ def measure_point(axis: str, value: int) -> dict:
     config = make_config(axis, value)
     setup = set_up_training(config, explore=False)
     if axis == "scenes":
-        bank = repeat_scenes(setup.world.banks[0], value)
+        bank = repeat_scenes(setup.compiled_world.banks[0], value)
         _, env_params = build_environment(bank, {}, config.train_step_limit)
         setup = setup._replace(params=env_params)
     if axis == "chunks":
@@ -70,7 +70,7 @@ def measure_point(axis: str, value: int) -> dict:
     # The environment alone, which knows nothing of the hidden size, then whole updates.
     if axis != "hidden":
         num_episodes = value if axis == "environments" else NUM_EPISODES
-        walk = compile_walk(setup.world.env, setup.params, num_episodes)
+        walk = compile_walk(setup.compiled_world.env, setup.params, num_episodes)
         figures |= measure_program("environment", walk, NUM_STEPS)
     update = compile_update(setup, ARM)
     figures |= measure_program("training", update, config.steps_per_update)

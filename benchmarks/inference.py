@@ -66,7 +66,7 @@ class FixedInputs(NamedTuple):
 
 def main() -> None:
     setup = set_up_training(RunConfig())
-    env = setup.world.env
+    env = setup.compiled_world.env
     inputs = FixedInputs(init_params(SPEC, jax.random.key(1)), setup.params, setup.knowledge)
     print_report(
         {

@@ -38,14 +38,14 @@ def main(run_dirs: Sequence[str], split: str, num_episodes: int, min_cells: int)
     for run_dir in run_dirs:
         run = Run.open(run_dir)
         policies = run.policies(("layout",))
-        world = compile_evaluation_world(run.config, split, None, None, PlainConsole(stderr=True))
-        home_sizes = {scene.name: longest_side(scene) for scene in world.scenes}
+        compiled_world = compile_evaluation_world(run.config, split, None, None, PlainConsole(stderr=True))
+        home_sizes = {scene.name: longest_side(scene) for scene in compiled_world.scenes}
         row = table_row("layout", None, None, "argmax")
         assert policies.spec.spatial_memory is not None
         torus = TorusMemory(**dataclasses.asdict(policies.spec.spatial_memory))
         torus_policies = policies._replace(spec=dataclasses.replace(policies.spec, spatial_memory=torus))
         for memory_name, memory_policies in (("window", policies), ("torus", torus_policies)):
-            episode_lists, outcome, _ = evaluate_rows([row], memory_policies, world, num_episodes, 0)
+            episode_lists, outcome, _ = evaluate_rows([row], memory_policies, compiled_world, num_episodes, 0)
             [episodes] = episode_lists
             metrics = episode_metrics(outcome, episodes.best_length, ())
 

@@ -106,14 +106,14 @@ def main(run_dir: str, predictor_names: Sequence[str], penalty: float, num_searc
     look_counts = {}
     agent_loops = {}
     for index, split in enumerate(("train", "val")):
-        world = compile_evaluation_world(run.config, split, None, 0.0, console)
-        agent_loops[split] = policies.make_agent_loop(world)
+        compiled_world = compile_evaluation_world(run.config, split, None, 0.0, console)
+        agent_loops[split] = policies.make_agent_loop(compiled_world)
         explore = jax.jit(explore_homes, static_argnums=(0, 6, 7))
         snapshots[split], look_counts[split] = explore(
             agent_loops[split],
             init_params(policies.spec, key),
-            locate_objects(world.banks[0]),
-            world.make_env_params(0),
+            locate_objects(compiled_world.banks[0]),
+            compiled_world.make_env_params(0),
             policies.knowledge,
             jax.random.fold_in(key, index),
             num_searches,

@@ -25,7 +25,9 @@ def main() -> None:
     trainers = {}
     for num_seeds in NUM_SEEDS:
         run_config = dataclasses.replace(config, seeds=num_seeds)
-        trainers[num_seeds] = make_trainer(run_config, setup.world.env, setup.estimator_config, setup.knowledge)
+        trainers[num_seeds] = make_trainer(
+            run_config, setup.compiled_world.env, setup.estimator_config, setup.knowledge
+        )
 
     # One call for each number of seeds, and one for each seed of the largest run on its own.
     calls = {}

@@ -32,24 +32,24 @@ def main() -> None:
 
     # Compile the houses; rooms are counted in a sample of them.
     start_time = time.perf_counter()
-    world = compile_training_world(config, PlainConsole(stderr=True))
+    compiled_world = compile_training_world(config, PlainConsole(stderr=True))
     compile_s = time.perf_counter() - start_time
-    assert isinstance(world.banks, Shards)
-    disk_bytes = sum(file.stat().st_size for path in world.banks.paths for file in path.rglob("*"))
+    assert isinstance(compiled_world.banks, Shards)
+    disk_bytes = sum(file.stat().st_size for path in compiled_world.banks.paths for file in path.rglob("*"))
     num_sampled = min(num_houses, 200)
-    rooms_per_house = sum(len(world.scenes[index].rooms) for index in range(num_sampled)) / num_sampled
+    rooms_per_house = sum(len(compiled_world.scenes[index].rooms) for index in range(num_sampled)) / num_sampled
 
     # Prepare the training.
     start_time = time.perf_counter()
-    exploration = jax.block_until_ready(explore_world(config, world))
+    exploration = jax.block_until_ready(explore_world(config, compiled_world))
     explore_s = time.perf_counter() - start_time
     estimator_config = ESTIMATORS[config.layout.setting]
-    knowledge = learn_knowledge(config, world, exploration, estimator_config)
-    trainer = make_trainer(config, world.env, estimator_config, knowledge)
+    knowledge = learn_knowledge(config, compiled_world, exploration, estimator_config)
+    trainer = make_trainer(config, compiled_world.env, estimator_config, knowledge)
 
     # One training stays within a bank; the other takes the next bank for each chunk, one more for the warm-up.
-    first_params = world.make_env_params(0)
-    next_params = prefetch_env_params(world, draw_bank_order(world, config.seed, TURNS + 1))
+    first_params = compiled_world.make_env_params(0)
+    next_params = prefetch_env_params(compiled_world, draw_bank_order(compiled_world, config.seed, TURNS + 1))
     states = {name: trainer.init(first_params) for name in ("in_memory", "streamed")}
 
     def train_in_memory() -> None:
@@ -64,8 +64,8 @@ def main() -> None:
     print_report(
         {
             "houses": num_houses,
-            "shards": len(world.banks),
-            "scenes_per_shard": world.num_scenes,
+            "shards": len(compiled_world.banks),
+            "scenes_per_shard": compiled_world.num_scenes,
             "compile_s": round(compile_s, 1),
             "houses_per_s": round(num_houses / compile_s, 1),
             "disk_gb": round(disk_bytes / 1e9, 2),

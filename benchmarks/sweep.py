@@ -44,12 +44,14 @@ def main() -> None:
     weights = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(state.params for state in states[ARM]))
 
     # The grid has a cell for every threshold and seed.
-    world = compile_evaluation_world(config, "val", None, None, console)
-    episodes = [(draw_episodes(world.banks[0], NUM_EPISODES, 0), world.make_env_params(0))]
+    compiled_world = compile_evaluation_world(config, "val", None, None, console)
+    episodes = [(draw_episodes(compiled_world.banks[0], NUM_EPISODES, 0), compiled_world.make_env_params(0))]
     rows = [table_row("stde", epsilon, "residual", "argmax") for epsilon in EPSILONS]
     grid = inference_grid(rows, config.arms, NUM_SEEDS)
     cells = [take_cell(grid, index) for index in range(len(grid.policy_index))]
-    agent_loop = AgentLoop(world.env, config.policy_spec(len(world.env.categories)), setup.estimator_config)
+    agent_loop = AgentLoop(
+        compiled_world.env, config.policy_spec(len(compiled_world.env.categories)), setup.estimator_config
+    )
 
     def evaluate(evaluator: Evaluator, grid: InferenceConfig) -> EpisodeOutcome:
         return evaluator(grid, weights, episodes, setup.knowledge, jax.random.key(0))

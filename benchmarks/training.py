@@ -27,7 +27,7 @@ def main() -> None:
     calls = {}
     for name, run_config in run_configs.items():
         mesh = accelerator_mesh(run_config)
-        trainer = make_trainer(run_config, setup.world.env, setup.estimator_config, setup.knowledge, mesh)
+        trainer = make_trainer(run_config, setup.compiled_world.env, setup.estimator_config, setup.knowledge, mesh)
         calls[name] = make_training_call(trainer, trainer.init(setup.params), setup.params)
 
     times = time_in_turns(calls, TURNS)

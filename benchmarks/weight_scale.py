@@ -69,20 +69,20 @@ def main(folder: Path, methods: list[str], total_steps: int) -> None:
                 ppo=SEMEXP_PPO if method == "semexp" else PPOConfig(),
             )
             run = jaxnav.train(config)
-            world = compile_evaluation_world(run.config, "val", None, None, Console(quiet=True))
+            compiled_world = compile_evaluation_world(run.config, "val", None, None, Console(quiet=True))
             policies = run.policies()
             fresh_params = init_params(policies.spec, jax.random.key(0))
             untrained = policies._replace(params=jax.tree.map(lambda leaf: leaf[None], fresh_params))
-            row = {"method": method, "weights": weight_kind} | measure(policies, world)
-            rows.append(row | {"untrained": measure(untrained, world)["categories / Z"]})
+            row = {"method": method, "weights": weight_kind} | measure(policies, compiled_world)
+            rows.append(row | {"untrained": measure(untrained, compiled_world)["categories / Z"]})
             print(rows[-1], file=sys.stderr, flush=True)
     print(format_table(rows), file=sys.stderr)
     print_report({"total_steps": total_steps, "rows": rows})
 
 
-def measure(policies: Policies, world: CompiledWorld) -> dict[str, float]:
+def measure(policies: Policies, compiled_world: CompiledWorld) -> dict[str, float]:
     """Measure the weights of the first policy, and what Z changes in the input of its recurrent core."""
-    recorded = jax.tree.map(np.asarray, record_steps(policies, world))
+    recorded = jax.tree.map(np.asarray, record_steps(policies, compiled_world))
 
     # Visible categories other than the goal, in episodes that still run: [T, E, K].
     counted = recorded["visible"] & ~recorded["is_goal"] & recorded["running"][..., None]
@@ -100,10 +100,10 @@ def measure(policies: Policies, world: CompiledWorld) -> dict[str, float]:
     return {name: float(f"{value:.3g}") for name, value in row.items()}
 
 
-def record_steps(policies: Policies, world: CompiledWorld) -> dict[str, jax.Array]:
+def record_steps(policies: Policies, compiled_world: CompiledWorld) -> dict[str, jax.Array]:
     """Act for some steps in random episodes, and record each of them, leaves [T, E, ...]."""
-    agent_loop = policies.make_agent_loop(world)
-    env_params = world.make_env_params(0)
+    agent_loop = policies.make_agent_loop(compiled_world)
+    env_params = compiled_world.make_env_params(0)
     knowledge = policies.knowledge
     keys = jax.random.split(jax.random.key(0), NUM_EPISODES)
 
@@ -138,7 +138,7 @@ def record_steps(policies: Policies, world: CompiledWorld) -> dict[str, jax.Arra
                 "weights": inputs.layout_weights,
                 "prior_weights": agent_loop.prior_weights(agent, knowledge, env_params),
                 "factor": factor,
-                "visible": world.env.row_format.presence(inputs.observation.row),
+                "visible": compiled_world.env.row_format.presence(inputs.observation.row),
                 "is_goal": is_goal,
                 "running": running,
             }

@@ -133,19 +133,19 @@ class Bench:
             run.config, self.config.split, None, shift, self.console, shift_by=self.config.shift_by
         )
 
-    def draw_episodes(self, world: CompiledWorld, num_folds: int = 1) -> EpisodeList:
+    def draw_episodes(self, compiled_world: CompiledWorld, num_folds: int = 1) -> EpisodeList:
         """Draw the episodes of the experiment in a world, or the share of one of several folds.
 
         Raises:
           InputError: the scenes fill more than one shard.
         """
-        if len(world.banks) > 1:
+        if len(compiled_world.banks) > 1:
             raise InputError(
-                f"split {self.config.split}: its {len(world.scenes)} scenes fill {len(world.banks)} shards, but a "
-                f"measurement needs one; set worlds.shard_scenes to {len(world.scenes)} or more"
+                f"split {self.config.split}: its {len(compiled_world.scenes)} scenes fill {len(compiled_world.banks)} "
+                f"shards, but a measurement needs one; set worlds.shard_scenes to {len(compiled_world.scenes)} or more"
             )
         num_episodes = -(-self.config.episodes // num_folds)  # rounded up
-        return draw_episodes(world.banks[0], num_episodes, self.config.seed)
+        return draw_episodes(compiled_world.banks[0], num_episodes, self.config.seed)
 
     def evaluate(self, run: AgentRun, shift: float) -> Scores:
         """Train a run if necessary, and evaluate its variants as `jaxnav eval` does."""

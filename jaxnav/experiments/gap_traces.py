@@ -127,7 +127,7 @@ def _trace_shift(
 ) -> GapTraces:
     """Walk the episodes of one shift with the layout arm."""
     # Each estimator starts from a prior of its own, [rooms, K, K], made from the same counts.
-    world = bench.compile_world(run, shift)
+    compiled_world = bench.compile_world(run, shift)
     estimator_priors = []
     for estimator in estimators.values():
         estimator_priors.append(layout_priors(policies.prior_counts, estimator))
@@ -135,9 +135,9 @@ def _trace_shift(
     # The key depends on the experiment's seed alone, so walks at different shifts share their random numbers.
     return trace_gaps(
         policies.arm_params("layout"),
-        bench.draw_episodes(world),
-        world.make_env_params(0),
-        policies.make_agent_loop(world),
+        bench.draw_episodes(compiled_world),
+        compiled_world.make_env_params(0),
+        policies.make_agent_loop(compiled_world),
         policies.knowledge,
         list(estimators.values()),
         jnp.stack(estimator_priors),

@@ -59,9 +59,11 @@ def measure_instrument(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
     shifts = bench.config.shifts
     totals_by_shift = []
     for shift in shifts:
-        world = bench.compile_world(run, shift)
+        compiled_world = bench.compile_world(run, shift)
         episodes = bench.config.episodes
-        totals_by_shift.append(measure_scenes(world, policies, layout_blind_policies, episodes, bench.config.seed))
+        totals_by_shift.append(
+            measure_scenes(compiled_world, policies, layout_blind_policies, episodes, bench.config.seed)
+        )
     yield from compare_shifts({"world": run.world, "run": run.agent}, shifts, totals_by_shift)
 
 
@@ -89,14 +91,18 @@ class SceneTotals(NamedTuple):
 
 
 def measure_scenes(
-    world: CompiledWorld, policies: Policies, layout_blind_policies: Policies | None, num_episodes: int, seed: int
+    compiled_world: CompiledWorld,
+    policies: Policies,
+    layout_blind_policies: Policies | None,
+    num_episodes: int,
+    seed: int,
 ) -> SceneTotals:
     """Measure the scenes of a world at one shift.
 
     L* and Random are exact means over all episodes that could be drawn in a scene, not over the drawn ones.
 
     Args:
-      world: the scenes.
+      compiled_world: the scenes.
       policies: policies with the baseline among their arms.
       layout_blind_policies: policies of layout-blind agents, with as many seeds.
       num_episodes: number of episodes in all scenes together.
@@ -104,7 +110,7 @@ def measure_scenes(
     """
     # Results of the baseline, bool [2, S, E]: with best actions, and with sampled ones.
     rows = [table_row("baseline", None, None, decoding) for decoding in ("argmax", "sample")]
-    episode_lists, outcome, _ = evaluate_rows(rows, policies, world, num_episodes, seed)
+    episode_lists, outcome, _ = evaluate_rows(rows, policies, compiled_world, num_episodes, seed)
     episodes = join_episode_lists(episode_lists)
     num_scenes = len(episodes.scenes)
 
@@ -117,10 +123,10 @@ def measure_scenes(
 
     # Measures without training, bank by bank. The scenes are read once, in order.
     priors = np.asarray(policies.knowledge.layout, np.float64)
-    scenes_in_order = (world.scenes[index] for index in range(len(world.scenes)))
+    scenes_in_order = (compiled_world.scenes[index] for index in range(len(compiled_world.scenes)))
     bank_measures = []
-    for bank, bank_episodes in zip(world.banks, episode_lists, strict=True):
-        bank_measures.append(_measure_bank(bank, bank_episodes, world, priors, scenes_in_order))
+    for bank, bank_episodes in zip(compiled_world.banks, episode_lists, strict=True):
+        bank_measures.append(_measure_bank(bank, bank_episodes, compiled_world, priors, scenes_in_order))
     scenes = BankMeasures(*map(np.concatenate, zip(*bank_measures, strict=True)))
 
     # Exact means count as often as a scene has episodes, so that all measures are sums over episodes.
@@ -147,7 +153,7 @@ def measure_scenes(
 
     # Layout-blind agents meet the same episodes.
     if layout_blind_policies is not None:
-        _, layout_blind_outcome, _ = evaluate_rows(rows, layout_blind_policies, world, num_episodes, seed)
+        _, layout_blind_outcome, _ = evaluate_rows(rows, layout_blind_policies, compiled_world, num_episodes, seed)
         layout_blind_metrics = episode_metrics(layout_blind_outcome, episodes.best_length)
         argmax_success, sample_success = 100.0 * layout_blind_metrics["sr"]
         argmax_wrong, sample_wrong = 100.0 * layout_blind_metrics["wrong_done"]
@@ -163,7 +169,7 @@ def measure_scenes(
 
     # Room types in the order of the scenes, bank by bank.
     room_types: list[str] = []
-    for bank in world.banks:
+    for bank in compiled_world.banks:
         room_types.extend(bank.room_types)
 
     return SceneTotals(
@@ -197,10 +203,10 @@ class BankMeasures(NamedTuple):
 
 
 def _measure_bank(
-    bank: Bank, episodes: EpisodeList, world: CompiledWorld, priors: np.ndarray, scenes: Iterator[Scene]
+    bank: Bank, episodes: EpisodeList, compiled_world: CompiledWorld, priors: np.ndarray, scenes: Iterator[Scene]
 ) -> BankMeasures:
     # The frontier search plays the drawn episodes within the step limits of their scenes.
-    step_limits = world.scene_step_limits(bank)
+    step_limits = compiled_world.scene_step_limits(bank)
     frontier = run_frontier_search(bank, episodes, step_limits)
 
     # Every scene is compared with the prior of its own room type, both [N, K, K].

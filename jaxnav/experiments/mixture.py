@@ -430,12 +430,12 @@ class MixedPopulation(NamedTuple):
     """Episodes of several shifts in one world.
 
     Attributes:
-      world: the scenes of all shifts, concatenated.
+      compiled_world: the scenes of all shifts, concatenated.
       episodes: equally many episodes at each shift.
       shift_index: int [E], index of each episode's shift.
     """
 
-    world: CompiledWorld
+    compiled_world: CompiledWorld
     episodes: EpisodeList
     shift_index: np.ndarray
 
@@ -456,7 +456,7 @@ def draw_mixed_population(bench: Bench, run: AgentRun, shifts: Sequence[float], 
         num_poses.append(len(world.banks[0].rows))
 
     return MixedPopulation(
-        world=concatenate_worlds(worlds),
+        compiled_world=concatenate_worlds(worlds),
         episodes=join_end_to_end(episode_lists, num_poses),
         shift_index=np.repeat(np.arange(len(shifts)), num_episodes),
     )

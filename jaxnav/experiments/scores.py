@@ -226,11 +226,11 @@ def num_scenes(episodes: EpisodeList) -> int:
 def measure_frontier(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
     """Score frontier search, which needs no training, on the episodes of a run."""
     for shift in bench.config.shifts:
-        world = bench.compile_world(run, shift)
-        episode_lists = draw_episode_lists(world, bench.config.episodes, bench.config.seed)
+        compiled_world = bench.compile_world(run, shift)
+        episode_lists = draw_episode_lists(compiled_world, bench.config.episodes, bench.config.seed)
         outcomes = []
-        for bank, bank_episodes in zip(world.banks, episode_lists, strict=True):
-            outcomes.append(run_frontier_search(bank, bank_episodes, world.scene_step_limits(bank)))
+        for bank, bank_episodes in zip(compiled_world.banks, episode_lists, strict=True):
+            outcomes.append(run_frontier_search(bank, bank_episodes, compiled_world.scene_step_limits(bank)))
 
         # The search is deterministic, so it counts as a single run: leaves [1, E].
         outcome = jax.tree.map(lambda *leaves: np.concatenate(leaves)[None], *outcomes)

@@ -175,12 +175,12 @@ class EvaluatedRun(NamedTuple):
 
     Attributes:
       policies: policies of the run.
-      world: the scenes at one layout shift.
+      compiled_world: the scenes at one layout shift.
       episodes: episodes in these scenes.
     """
 
     policies: Policies
-    world: CompiledWorld
+    compiled_world: CompiledWorld
     episodes: EpisodeList
 
 
@@ -350,12 +350,12 @@ def prepare_run(bench: Bench, run: AgentRun, shift: float) -> EvaluatedRun:
       InputError: the scenes fill more than one shard.
     """
     bench.train(run)
-    world = bench.compile_world(run, shift)
+    compiled_world = bench.compile_world(run, shift)
     policies = load_policies(run.config, run.config.arms)
     if "baseline" not in run.config.arms:
         duplicated_params = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), policies.params)
         policies = policies._replace(params=duplicated_params, arms=ARMS)
-    return EvaluatedRun(policies, world, bench.draw_episodes(world))
+    return EvaluatedRun(policies, compiled_world, bench.draw_episodes(compiled_world))
 
 
 def _plain_trials(decodings: Sequence[Decoding], with_baseline: bool) -> list[Trial]:

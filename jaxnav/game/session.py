@@ -45,7 +45,7 @@ class Game(NamedTuple):
     """Episode to be played by hand, with the agent whose belief is displayed.
 
     Attributes:
-      world: compiled scenes; the game takes place in the first bank.
+      compiled_world: compiled scenes; the game takes place in the first bank.
       episode: list of one episode.
       knowledge: layout priors.
       estimator_config: configuration of the layout estimator.
@@ -53,7 +53,7 @@ class Game(NamedTuple):
       epsilon: threshold of sTDE in the advice.
     """
 
-    world: CompiledWorld
+    compiled_world: CompiledWorld
     episode: EpisodeList
     knowledge: Knowledge
     estimator_config: EstimatorConfig
@@ -63,7 +63,7 @@ class Game(NamedTuple):
     @property
     def bank(self) -> Bank:
         """Tables of the scenes."""
-        return self.world.banks[0]
+        return self.compiled_world.banks[0]
 
     @property
     def goal(self) -> str:
@@ -135,10 +135,10 @@ def prepare_game(config: PlayConfig, console: Console) -> Game:
     # The game takes one episode of the list that an evaluation with this seed would play.
     worlds = WorldConfig(seed=config.seed, front_cell=front_cell)
     run_config = RunConfig(world=config.world, worlds=worlds, layout=layout_config)
-    world = compile_evaluation_world(
+    compiled_world = compile_evaluation_world(
         run_config, config.split, config.scenes, config.shift, console, shift_by=config.shift_by
     )
-    episode = choose_episode(world.banks[0], config.goal, config.seed)
+    episode = choose_episode(compiled_world.banks[0], config.goal, config.seed)
 
     # Without a policy that estimates the layout, the belief starts from random walks in training scenes.
     if adviser is not None and adviser.estimator_config is not None:
@@ -149,7 +149,7 @@ def prepare_game(config: PlayConfig, console: Console) -> Game:
         exploration = explore_world(run_config, training_world)
         estimator_config = calibrate_estimator(run_config, training_world, exploration, console)
         knowledge = Knowledge(layout_priors(exploration.prior_counts, estimator_config))
-    return Game(world, episode, knowledge, estimator_config, adviser, config.epsilon)
+    return Game(compiled_world, episode, knowledge, estimator_config, adviser, config.epsilon)
 
 
 def choose_episode(bank: Bank, goal: str | None, seed: int) -> EpisodeList:
@@ -181,8 +181,8 @@ def play_game(game: Game, keys: Iterable[str], show: Callable[[GameView], None])
       show: receives the view at the start and after each action but the last.
     """
     # The agent is a batch of one, steered by the keys.
-    agent_loop = AgentLoop(game.world.env, None, game.estimator_config)
-    params = game.world.make_env_params(0)
+    agent_loop = AgentLoop(game.compiled_world.env, None, game.estimator_config)
+    params = game.compiled_world.make_env_params(0)
     agent = _begin(agent_loop, start_states(game.episode), None, game.knowledge, params)
     poses = [int(agent.state.pose[0])]
     scene = int(game.episode.scene[0])

@@ -210,7 +210,7 @@ def _map_text(game: Game, poses: list[int], shortest_poses: list[int], columns: 
     """Return the map of the scene with both paths; +z is up."""
     scene_index = int(game.episode.scene[0])
     scene_name = game.bank.names[scene_index]
-    scene = find_scenes(game.world, [scene_name])[scene_name]
+    scene = find_scenes(game.compiled_world, [scene_name])[scene_name]
 
     # Walls, standable cells and furniture, [nz, nx]. Characters are about twice as high as wide: spaces keep the
     # proportions where they fit.

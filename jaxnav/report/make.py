@@ -131,7 +131,7 @@ def measure_shifts(
     measured: dict[float, ShiftMeasurements] = {}
     if trained_shift in shifts:
         measured[trained_shift] = measure_shift(run, reference_run, trained_shift, config, console)
-        world = measured[trained_shift].world
+        world = measured[trained_shift].compiled_world
         # Streamed scenes are divided otherwise at other shifts.
         if len(world.banks) == 1:
             trained_layout = TrainedLayout(trained_shift, world)

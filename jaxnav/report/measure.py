@@ -33,7 +33,7 @@ class ShiftMeasurements(NamedTuple):
       similarity: success by layout similarity; None if scenes are streamed.
       gaps: layout gap along the episodes; None if scenes are streamed, or without the layout.
       replays: episodes, step by step.
-      world: compiled scenes.
+      compiled_world: compiled scenes.
     """
 
     results: Results
@@ -41,7 +41,7 @@ class ShiftMeasurements(NamedTuple):
     similarity: SuccessBySimilarity | None
     gaps: GapTraces | None
     replays: Replays
-    world: CompiledWorld
+    compiled_world: CompiledWorld
 
 
 def measure_shift(
@@ -66,10 +66,10 @@ def measure_shift(
       InputError: no finished run, an impossible option, or runs that cannot be compared.
     """
     # Evaluate the run.
-    world = compile_evaluation_world(run.config, config.split, None, shift, console, shift_by=config.shift_by)
-    results = _evaluate(run, shift, world, config, console)
+    compiled_world = compile_evaluation_world(run.config, config.split, None, shift, console, shift_by=config.shift_by)
+    results = _evaluate(run, shift, compiled_world, config, console)
     policies = run.policies()
-    agents = _select_agents(results, policies, world, config.threshold)
+    agents = _select_agents(results, policies, compiled_world, config.threshold)
 
     # Compare with layout-blind agents, and replay them with best actions, too.
     account = None
@@ -89,17 +89,17 @@ def measure_shift(
                 agents.append(agent._replace(role="reference"))
 
     # Similarity and gap need all scenes in one bank.
-    episodes = _episodes_of_first_bank(results.episodes, world)
-    has_one_bank = len(world.banks) == 1
-    similarity = _measure_similarity(results, policies, world) if has_one_bank else None
+    episodes = _episodes_of_first_bank(results.episodes, compiled_world)
+    has_one_bank = len(compiled_world.banks) == 1
+    similarity = _measure_similarity(results, policies, compiled_world) if has_one_bank else None
     gap_traces = None
     if has_one_bank and policies.estimator_config is not None:
         with show_activity(console, f"measuring the layout gap at shift {shift:g}"):
             gap_traces = trace_gaps(
                 policies.arm_params("layout"),
                 episodes,
-                world.make_env_params(0),
-                policies.make_agent_loop(world),
+                compiled_world.make_env_params(0),
+                policies.make_agent_loop(compiled_world),
                 policies.knowledge,
                 [policies.estimator_config],
                 layout_priors(policies.prior_counts, policies.estimator_config)[None],
@@ -111,10 +111,12 @@ def measure_shift(
     replays_per_shift = config.replays // len(set(config.shift))
     with show_activity(console, f"playing episodes for the replays at shift {shift:g}"):
         replays = make_replays(agents, episodes, replays_per_shift, shift, config.split, trained_layout)
-    return ShiftMeasurements(results, account, similarity, gap_traces, replays, world)
+    return ShiftMeasurements(results, account, similarity, gap_traces, replays, compiled_world)
 
 
-def _evaluate(run: Run, shift: float, world: CompiledWorld, config: ReportConfig, console: PlainConsole) -> Results:
+def _evaluate(
+    run: Run, shift: float, compiled_world: CompiledWorld, config: ReportConfig, console: PlainConsole
+) -> Results:
     """Evaluate a run at a shift, as `jaxnav eval` does."""
     return evaluate(
         run,
@@ -124,14 +126,16 @@ def _evaluate(run: Run, shift: float, world: CompiledWorld, config: ReportConfig
         episodes=config.episodes,
         epsilon=sorted({*config.epsilon, config.threshold}),
         seed=config.seed,
-        compiled=world,
+        compiled=compiled_world,
         console=console,
     )
 
 
-def _select_agents(results: Results, policies: Policies, world: CompiledWorld, threshold: float) -> list[ReplayAgent]:
+def _select_agents(
+    results: Results, policies: Policies, compiled_world: CompiledWorld, threshold: float
+) -> list[ReplayAgent]:
     """Return the agents whose episodes are replayed: those with best actions, and sTDE at the threshold."""
-    num_episodes = len(_episodes_of_first_bank(results.episodes, world).goal)
+    num_episodes = len(_episodes_of_first_bank(results.episodes, compiled_world).goal)
 
     # Rows of the oracle and of TDE have no place among the pairs that the page compares.
     agents = []
@@ -142,20 +146,22 @@ def _select_agents(results: Results, policies: Policies, world: CompiledWorld, t
         episode_success = np.asarray(results.outcome.success)[row_index, 0, :num_episodes]
         episode_length = np.asarray(results.outcome.length)[row_index, 0, :num_episodes]
         agent_name = row_label(results.report["rows"][row_index])
-        agents.append(ReplayAgent(row.variant, agent_name, policies, world, row, episode_success, episode_length))
+        agents.append(
+            ReplayAgent(row.variant, agent_name, policies, compiled_world, row, episode_success, episode_length)
+        )
     return agents
 
 
-def _episodes_of_first_bank(episodes: EpisodeList, world: CompiledWorld) -> EpisodeList:
+def _episodes_of_first_bank(episodes: EpisodeList, compiled_world: CompiledWorld) -> EpisodeList:
     """Return the episodes of the first bank; all banks have equally many."""
-    return episodes.take(np.arange(len(episodes.goal) // len(world.banks)))
+    return episodes.take(np.arange(len(episodes.goal) // len(compiled_world.banks)))
 
 
-def _measure_similarity(results: Results, policies: Policies, world: CompiledWorld) -> SuccessBySimilarity:
+def _measure_similarity(results: Results, policies: Policies, compiled_world: CompiledWorld) -> SuccessBySimilarity:
     """Relate the success of the first row to layout similarity."""
     # Counts of the prior for each scene's type of room, [scenes, K, K].
-    bank = world.banks[0]
-    room_of_scene = np.asarray(world.make_env_params(0).room)[: len(bank.names)]
+    bank = compiled_world.banks[0]
+    room_of_scene = np.asarray(compiled_world.make_env_params(0).room)[: len(bank.names)]
     prior_counts = np.asarray(policies.prior_counts, np.float64)[room_of_scene]
 
     # One point for each scene and goal, with the success of the episodes that belong to it.

@@ -57,7 +57,7 @@ class ReplayAgent(NamedTuple):
       role: the variant of its row, or `reference` for layout-blind agents.
       name: name of the row in tables.
       policies: policies of its run.
-      world: compiled scenes, equal for all agents.
+      compiled_world: compiled scenes, equal for all agents.
       row: row of the evaluation, with best actions.
       success: bool [E], success of the first seed.
       length: int [E], actions of the first seed.
@@ -66,7 +66,7 @@ class ReplayAgent(NamedTuple):
     role: Variant | Literal["reference"]
     name: str
     policies: Policies
-    world: CompiledWorld
+    compiled_world: CompiledWorld
     row: EvaluationRow
     success: np.ndarray
     length: np.ndarray
@@ -81,11 +81,11 @@ class TrainedLayout(NamedTuple):
 
     Attributes:
       shift: layout shift of training.
-      world: compiled scenes.
+      compiled_world: compiled scenes.
     """
 
     shift: float
-    world: CompiledWorld
+    compiled_world: CompiledWorld
 
 
 @dataclasses.dataclass(frozen=True)
@@ -271,18 +271,18 @@ def make_replays(
     selected_episodes = episodes.take(selected_indices)
     players = []
     for agent, tracer in zip(agents, _make_tracers(agents), strict=True):
-        traces = replay_episodes(agent.policies, agent.world, selected_episodes, agent.row)
-        players.append(_Player(agent.name, agent.row, shift, agent.world.banks[0], tracer, traces))
+        traces = replay_episodes(agent.policies, agent.compiled_world, selected_episodes, agent.row)
+        players.append(_Player(agent.name, agent.row, shift, agent.compiled_world.banks[0], tracer, traces))
 
     # The agent in the layout of training is one more player, and the only one in other scenes.
-    worlds_by_shift = {shift: agents[0].world}
+    worlds_by_shift = {shift: agents[0].compiled_world}
     if trained_layout is not None and trained_traces is not None:
         comparisons[LAYOUT_PAIR] = (len(players), main_index)
         player_name = f"{main_agent.name}, shift {trained_layout.shift:g}"
-        trained_bank = trained_layout.world.banks[0]
+        trained_bank = trained_layout.compiled_world.banks[0]
         tracer = players[main_index].tracer
         players.append(_Player(player_name, main_agent.row, trained_layout.shift, trained_bank, tracer, trained_traces))
-        worlds_by_shift[trained_layout.shift] = trained_layout.world
+        worlds_by_shift[trained_layout.shift] = trained_layout.compiled_world
         for counts in differ:
             counts.append(None)
         differ.append([None] * len(players))
@@ -300,7 +300,7 @@ def make_replays(
         replay_episode_list.append(ReplayEpisode(plans[shift, scene].plan_index, goal, best_length, courses))
 
     # Names, thresholds and differences stand in the order of the players.
-    task = agents[0].world.banks[0].task
+    task = agents[0].compiled_world.banks[0].task
     return Replays(
         shift=shift,
         split=split,
@@ -446,12 +446,12 @@ def _play_in_layout(
     """
     # Objects lie at other places, so that a goal may be out of reach; 0 is no length.
     candidates = select_episodes(agents, len(episodes.goal))
-    lengths = layout.world.banks[0].best_length[episodes.pose[candidates], episodes.goal[candidates]]
+    lengths = layout.compiled_world.banks[0].best_length[episodes.pose[candidates], episodes.goal[candidates]]
     candidates = candidates[lengths > 0][: _LAYOUT_CANDIDATES * count]
     if len(candidates) == 0:
         return select_episodes(agents, count), None
 
-    traces = replay_episodes(agent.policies, layout.world, episodes.take(candidates), agent.row)
+    traces = replay_episodes(agent.policies, layout.compiled_world, episodes.take(candidates), agent.row)
     has_other_result = np.zeros(len(candidates), bool)
     for index, trace in enumerate(traces):
         has_other_result[index] = trace.success != agent.success[candidates[index]]

@@ -326,7 +326,7 @@ def _refuse_policy_options(name: str, is_given: dict[str, bool]) -> None:
 def evaluate_rows(
     rows: Sequence[EvaluationRow],
     policies: Policies,
-    world: CompiledWorld,
+    compiled_world: CompiledWorld,
     num_episodes: int,
     seed: int,
     evaluator: Evaluator | None = None,
@@ -336,7 +336,7 @@ def evaluate_rows(
     Args:
       rows: R rows, whose arms must be among those of the policies.
       policies: policies with S seeds of each arm.
-      world: compiled scenes.
+      compiled_world: compiled scenes.
       num_episodes: number of episodes in all banks together.
       seed: seed of the episode lists and the sampled actions.
       evaluator: evaluator with an agent loop of these policies, to share its compilations; None makes one.
@@ -344,10 +344,10 @@ def evaluate_rows(
     Returns:
       The episodes of each bank, the outcomes with leaves [R, S, E], and the number of compilations of the evaluator.
     """
-    episode_lists = draw_episode_lists(world, num_episodes, seed)
-    evaluator = evaluator or Evaluator(policies.make_agent_loop(world), has_controls=False)
+    episode_lists = draw_episode_lists(compiled_world, num_episodes, seed)
+    evaluator = evaluator or Evaluator(policies.make_agent_loop(compiled_world), has_controls=False)
     grid = inference_grid(rows, policies.arms, policies.num_seeds)
-    outcome = _run_grid(evaluator, grid, policies, world, episode_lists, seed)
+    outcome = _run_grid(evaluator, grid, policies, compiled_world, episode_lists, seed)
     return episode_lists, outcome, evaluator.compilations
 
 
@@ -356,7 +356,7 @@ def _evaluate_with_replacements(
     replacements: Sequence[Replacement],
     max_room_episodes: int,
     policies: Policies,
-    world: CompiledWorld,
+    compiled_world: CompiledWorld,
     episode_lists: Sequence[EpisodeList],
     seed: int,
 ) -> tuple[EpisodeOutcome, EpisodeOutcome, int]:
@@ -372,8 +372,8 @@ def _evaluate_with_replacements(
 
     # Only the parts that are replaced are compiled.
     parts = tuple(sorted({replacement.part for replacement in replacements}))
-    evaluator = Evaluator(policies.make_agent_loop(world), has_controls=False, replaced_parts=parts)
-    outcome = _run_grid(evaluator, grid, policies, world, episode_lists, seed)
+    evaluator = Evaluator(policies.make_agent_loop(compiled_world), has_controls=False, replaced_parts=parts)
+    outcome = _run_grid(evaluator, grid, policies, compiled_world, episode_lists, seed)
     row_outcome = jax.tree.map(lambda leaf: leaf[: len(rows)], outcome)
     replaced_outcome = jax.tree.map(lambda leaf: leaf[len(rows) :], outcome)
     return row_outcome, replaced_outcome, evaluator.compilations
@@ -383,13 +383,13 @@ def _run_grid(
     evaluator: Evaluator,
     grid: InferenceConfig,
     policies: Policies,
-    world: CompiledWorld,
+    compiled_world: CompiledWorld,
     episode_lists: Sequence[EpisodeList],
     seed: int,
 ) -> EpisodeOutcome:
     """Run a grid of rows and seeds, leaves [R S], over all banks; returns outcomes with leaves [R, S, E]."""
     # While one bank is evaluated, a thread reads the next.
-    env_params = prefetch_env_params(world, range(len(world.banks)))
+    env_params = prefetch_env_params(compiled_world, range(len(compiled_world.banks)))
     outcome = evaluator(
         grid,
         policies.params,
@@ -405,7 +405,7 @@ def _add_fallback_rows(
     rows: Sequence[EvaluationRow],
     outcome: EpisodeOutcome,
     policies: Policies,
-    world: CompiledWorld,
+    compiled_world: CompiledWorld,
     num_episodes: int,
     seed: int,
 ) -> tuple[list[EvaluationRow], EpisodeOutcome, int]:
@@ -423,7 +423,7 @@ def _add_fallback_rows(
     # Policies that hand over carry a second memory, so these rows are compiled apart.
     fallback_rows = [row for row in all_rows if row.uses_own_fallback]
     _, fallback_outcome, compilations = evaluate_rows(
-        fallback_rows, policies.with_own_fallback(), world, num_episodes, seed
+        fallback_rows, policies.with_own_fallback(), compiled_world, num_episodes, seed
     )
 
     # Put all rows into the order of the table.
@@ -790,13 +790,13 @@ def has_same_episodes(episodes: EpisodeList, other: EpisodeList) -> bool:
 
 
 def replay_episodes(
-    policies: Policies, world: CompiledWorld, episodes: EpisodeList, row: EvaluationRow
+    policies: Policies, compiled_world: CompiledWorld, episodes: EpisodeList, row: EvaluationRow
 ) -> list[EpisodeTrace]:
     """Play episodes of the first bank step by step, with the first seed.
 
     Args:
       policies: policies of the run.
-      world: compiled scenes.
+      compiled_world: compiled scenes.
       episodes: episodes of the first bank.
       row: row of a table, whose arm must be among those of the policies.
 
@@ -813,13 +813,13 @@ def replay_episodes(
         inference,
         params,
         start_states(episodes),
-        policies.make_agent_loop(world),
-        world.make_env_params(0),
+        policies.make_agent_loop(compiled_world),
+        compiled_world.make_env_params(0),
         policies.knowledge,
     )
 
 
-def find_scenes(world: CompiledWorld, names: Collection[str]) -> dict[str, Scene]:
+def find_scenes(compiled_world: CompiledWorld, names: Collection[str]) -> dict[str, Scene]:
     """Find scenes of a world by their names.
 
     The scenes are read once, in order, because generated ones are generated anew at each access.
@@ -829,10 +829,10 @@ def find_scenes(world: CompiledWorld, names: Collection[str]) -> dict[str, Scene
     """
     missing_names = set(names)
     scene_by_name: dict[str, Scene] = {}
-    for index in range(len(world.scenes)):
+    for index in range(len(compiled_world.scenes)):
         if not missing_names:
             break
-        scene = world.scenes[index]
+        scene = compiled_world.scenes[index]
         if scene.name in missing_names:
             scene_by_name[scene.name] = scene
             missing_names.remove(scene.name)

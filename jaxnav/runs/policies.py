@@ -251,14 +251,14 @@ class Policies(NamedTuple):
             )
         return self._replace(spec=dataclasses.replace(self.spec, counterfactual_memory=memory))
 
-    def make_agent_loop(self, world: CompiledWorld) -> AgentLoop:
+    def make_agent_loop(self, compiled_world: CompiledWorld) -> AgentLoop:
         """Agent loop of these policies in the scenes of a world.
 
         Raises:
           InputError: the scenes are compiled for other rules, or the method cannot act in them.
         """
         rule_differences = list_differences(
-            dataclasses.asdict(self.task.rules), dataclasses.asdict(world.env.task.rules)
+            dataclasses.asdict(self.task.rules), dataclasses.asdict(compiled_world.env.task.rules)
         )
         if rule_differences:
             raise InputError(
@@ -267,9 +267,9 @@ class Policies(NamedTuple):
             )
 
         # Some methods refuse scenes, such as those that are larger than their map.
-        world.check_method(self.spec.method, self.knowledge)
+        compiled_world.check_method(self.spec.method, self.knowledge)
         return AgentLoop(
-            world.env,
+            compiled_world.env,
             self.spec,
             self.estimator_config,
             self.inner_steps,

@@ -63,7 +63,7 @@ def limit_room_episodes(episode_lists: Sequence[EpisodeList], costs: Costs) -> i
 def count_shares(
     rows: Sequence[EvaluationRow],
     policies: Policies,
-    world: CompiledWorld,
+    compiled_world: CompiledWorld,
     episode_lists: Sequence[EpisodeList],
     seed: int,
 ) -> tuple[ShareCounts, EpisodeList]:
@@ -72,16 +72,16 @@ def count_shares(
     Args:
       rows: rows with decision shares, see `rows_with_shares`.
       policies: policies with S seeds of each arm.
-      world: compiled scenes.
+      compiled_world: compiled scenes.
       episode_lists: the evaluation's episodes, for each bank.
       seed: seed of the sampled actions.
 
     Returns:
       Counts, leaves [R, S, E] and [R, S, E, P], with the P parts in the order of `ReplacedPart`; and the E episodes.
     """
-    probe_stride = max(1, -(-world.step_limit // _PROBED_STEPS))  # rounded up
+    probe_stride = max(1, -(-compiled_world.step_limit // _PROBED_STEPS))  # rounded up
     parts = [part for part in ReplacedPart if part != ReplacedPart.NONE]
-    probe = ShareProbe(policies.make_agent_loop(world), parts, probe_stride)
+    probe = ShareProbe(policies.make_agent_loop(compiled_world), parts, probe_stride)
     grid = inference_grid(rows, policies.arms, policies.num_seeds)
 
     # Evenly spaced episodes of every bank.
@@ -96,7 +96,7 @@ def count_shares(
             grid,
             policies.params,
             start_states(probed_episodes),
-            world.make_env_params(bank_index),
+            compiled_world.make_env_params(bank_index),
             policies.knowledge,
             bank_key,
         )

@@ -171,8 +171,8 @@ def train_points(
 
     # All processes must train the same run. Settings are compared before the scenes, whose compilation may take long.
     check_agreement(json.dumps(make_manifest(run_settings(config))))
-    world = compile_training_world(config, console)
-    manifest_fields = {"scenes_fingerprint": world.fingerprint, "budget": config.steps_by_purpose}
+    compiled_world = compile_training_world(config, console)
+    manifest_fields = {"scenes_fingerprint": compiled_world.fingerprint, "budget": config.steps_by_purpose}
     if list(points) != [config]:
         ppo_settings = [run_settings(point)["ppo"] for point in points]
         manifest_fields["points"] = {name: [settings[name] for settings in ppo_settings] for name in ppo_settings[0]}
@@ -180,13 +180,13 @@ def train_points(
     check_agreement(json.dumps(manifest))
 
     with lock_run_dir(config) as lock:
-        _train_in_run_dir(config, points, world, manifest, mesh, lock, stopwatch, console, callback)
+        _train_in_run_dir(config, points, compiled_world, manifest, mesh, lock, stopwatch, console, callback)
 
 
 def _train_in_run_dir(
     config: RunConfig,
     points: Sequence[RunConfig],
-    world: CompiledWorld,
+    compiled_world: CompiledWorld,
     manifest: dict[str, Any],
     mesh: Mesh | None,
     lock: FolderLock,
@@ -204,31 +204,31 @@ def _train_in_run_dir(
         )
     warn_if_rollout_too_short(config, console)
     warn_if_more_steps(config, console)
-    preparation = prepare_training(config, world, manifest, console)
+    preparation = prepare_training(config, compiled_world, manifest, console)
     exploration, estimator_config, knowledge, fitted_params = preparation
     if fitted_params:
-        _finish_fitted_run(config, world, preparation, lock, stopwatch, console)
+        _finish_fitted_run(config, compiled_world, preparation, lock, stopwatch, console)
         return
 
-    trainer = make_trainer(config, world.env, estimator_config, knowledge, mesh, points)
+    trainer = make_trainer(config, compiled_world.env, estimator_config, knowledge, mesh, points)
 
     # Draw the bank of scenes in which each chunk trains.
-    bank_order = draw_bank_order(world, config.seed, config.total_updates // config.chunk)
-    if len(world.banks) > 1:
+    bank_order = draw_bank_order(compiled_world, config.seed, config.total_updates // config.chunk)
+    if len(compiled_world.banks) > 1:
         num_used = len(set(bank_order))
-        shard_counts = f"{len(bank_order)} turns in {num_used} of {len(world.banks)} shards"
+        shard_counts = f"{len(bank_order)} turns in {num_used} of {len(compiled_world.banks)} shards"
         console.print(f"training in one shard of scenes at a time: {shard_counts}")
 
     # Resume from the last checkpoint. A finished run needs no validator.
-    env_params = world.make_env_params(bank_order[0])
+    env_params = compiled_world.make_env_params(bank_order[0])
     states, update = _restore_or_init(config, trainer, env_params, manifest, console)
     stopwatch = stopwatch.resume(config.run_dir / TIMES_FILE)
     has_reach = all((point.run_dir / REACH_FILE).exists() for point in points)
     is_finished = update == config.total_updates and has_reach
-    validator = None if is_finished else _make_validator(config, trainer, knowledge, world, console)
+    validator = None if is_finished else _make_validator(config, trainer, knowledge, compiled_world, console)
 
     session = TrainingSession(
-        config, trainer, validator, world, bank_order, manifest, lock, stopwatch, console, callback
+        config, trainer, validator, compiled_world, bank_order, manifest, lock, stopwatch, console, callback
     )
     states = run_updates(session, states, update)
 
@@ -307,13 +307,13 @@ def warn_if_more_steps(config: RunConfig, console: PlainConsole) -> None:
 
 
 def prepare_training(
-    config: RunConfig, world: CompiledWorld, manifest: dict[str, Any], console: PlainConsole
+    config: RunConfig, compiled_world: CompiledWorld, manifest: dict[str, Any], console: PlainConsole
 ) -> Preparation:
     """Layout prior, layout estimator and the method's own statistics, learned once in each run.
 
     Args:
       config: configuration of the run, whose directory is locked.
-      world: compiled training scenes.
+      compiled_world: compiled training scenes.
       manifest: manifest of the run.
       console: console for progress.
 
@@ -331,42 +331,42 @@ def prepare_training(
 
     # Learn the layout prior, the estimator, and then everything that builds on both.
     with show_activity(console, "random walks for the layout prior"):
-        exploration = explore_world(config, world)
+        exploration = explore_world(config, compiled_world)
         num_steps = int(exploration.steps)
         num_poses = int(exploration.poses)
     console.print(f"layout prior from {num_steps:,} random steps, {num_poses:,} distinct poses")
     with show_activity(console, "calibrating the layout estimator"):
-        estimator_config = calibrate_estimator(config, world, exploration, console)
+        estimator_config = calibrate_estimator(config, compiled_world, exploration, console)
     with show_activity(console, "learning statistics of the training scenes"):
-        knowledge = learn_knowledge(config, world, exploration, estimator_config)
+        knowledge = learn_knowledge(config, compiled_world, exploration, estimator_config)
 
     # Methods without training by PPO fit their policies here.
     fitted_params: tuple[Params, ...] = ()
     if config.policy_method.fit is not None:
-        fitted_params = fit_policies(config, world, estimator_config, knowledge, console)
+        fitted_params = fit_policies(config, compiled_world, estimator_config, knowledge, console)
 
     preparation = Preparation(exploration, estimator_config, knowledge, fitted_params)
     run_on_first_process(lambda: save_preparation(config.run_dir, preparation, manifest))
     return preparation
 
 
-def explore_world(config: RunConfig, world: CompiledWorld) -> Exploration:
+def explore_world(config: RunConfig, compiled_world: CompiledWorld) -> Exploration:
     """Collect co-occurrence counts on random walks in the training scenes.
 
     The walks are divided equally among the banks of scenes.
     """
     key = jax.random.fold_in(jax.random.key(config.seed), _EXPLORE)
-    num_banks = len(world.banks)
+    num_banks = len(compiled_world.banks)
     walks_per_bank = -(-config.layout.walks // num_banks)  # rounded up
 
     # Explore bank by bank, and add up the counts.
     estimator_config = named_estimator(config)
     explore_bank = jax.jit(explore, static_argnums=(0, 3, 4, 5))
     explorations = []
-    for bank_index, params in enumerate(prefetch_env_params(world, range(num_banks))):
+    for bank_index, params in enumerate(prefetch_env_params(compiled_world, range(num_banks))):
         bank_key = jax.random.fold_in(key, bank_index)
         explorations.append(
-            explore_bank(world.env, params, bank_key, walks_per_bank, config.layout.steps, estimator_config)
+            explore_bank(compiled_world.env, params, bank_key, walks_per_bank, config.layout.steps, estimator_config)
         )
     exploration = jax.tree.map(lambda *bank_leaves: sum(bank_leaves), *explorations)
 
@@ -389,7 +389,7 @@ def named_estimator(config: RunConfig) -> EstimatorConfig:
 
 
 def calibrate_estimator(
-    config: RunConfig, world: CompiledWorld, exploration: Exploration, console: PlainConsole
+    config: RunConfig, compiled_world: CompiledWorld, exploration: Exploration, console: PlainConsole
 ) -> EstimatorConfig:
     """Configuration of the layout estimator, with strength and reduction.
 
@@ -406,8 +406,8 @@ def calibrate_estimator(
     candidate_reductions = REDUCTIONS if config.layout.reduction is None else (config.layout.reduction,)
     key = jax.random.fold_in(jax.random.key(config.seed), _CALIBRATE)
     calibration = calibrate(
-        world.env,
-        world.make_env_params(0),
+        compiled_world.env,
+        compiled_world.make_env_params(0),
         exploration.prior_counts,
         estimator_config,
         key,
@@ -424,7 +424,7 @@ def calibrate_estimator(
 
 
 def learn_knowledge(
-    config: RunConfig, world: CompiledWorld, exploration: Exploration, estimator_config: EstimatorConfig
+    config: RunConfig, compiled_world: CompiledWorld, exploration: Exploration, estimator_config: EstimatorConfig
 ) -> Knowledge:
     """Knowledge from before training: layout priors, the method's own, and evidence from co-occurrence.
 
@@ -436,7 +436,7 @@ def learn_knowledge(
     learn = find_method(config.method).learn
     method_knowledge = {}
     if learn is not None:
-        method_knowledge = jax.tree.map(jnp.asarray, learn(world.banks, np.asarray(exploration.counts)))
+        method_knowledge = jax.tree.map(jnp.asarray, learn(compiled_world.banks, np.asarray(exploration.counts)))
     if "layout" not in config.arms:
         return Knowledge(layout, method_knowledge)
 
@@ -446,20 +446,22 @@ def learn_knowledge(
     num_walks = limit_walks(_EVIDENCE_WALK_FACTOR * config.layout.walks, 1, num_categories)
     is_pooled = config.layout.prior == "pooled"
     learn_evidence = jax.jit(fit_shift_classifier, static_argnums=(0, 4, 5))
-    env_params = world.make_env_params(0)
-    cooccurrence = learn_evidence(world.env, env_params, exploration.counts, key, num_walks, is_pooled)
+    env_params = compiled_world.make_env_params(0)
+    cooccurrence = learn_evidence(compiled_world.env, env_params, exploration.counts, key, num_walks, is_pooled)
 
     # Log odds of the distances at which pairs were seen.
     near_key = jax.random.fold_in(jax.random.key(config.seed), _SIGHTINGS)
     num_walks = limit_walks(_SIGHTING_WALK_FACTOR * config.layout.walks, NUM_NEAR_FEATURES, num_categories)
     learn_near_evidence = jax.jit(fit_sighting_classifier, static_argnums=(0, 4, 5))
-    near_log_odds = learn_near_evidence(world.env, env_params, exploration.counts, near_key, num_walks, is_pooled)
+    near_log_odds = learn_near_evidence(
+        compiled_world.env, env_params, exploration.counts, near_key, num_walks, is_pooled
+    )
     return Knowledge(layout, method_knowledge, cooccurrence._replace(near_log_odds=near_log_odds))
 
 
 def fit_policies(
     config: RunConfig,
-    world: CompiledWorld,
+    compiled_world: CompiledWorld,
     estimator_config: EstimatorConfig,
     knowledge: Knowledge,
     console: PlainConsole,
@@ -468,16 +470,16 @@ def fit_policies(
 
     Args:
       config: configuration of the run, whose method is fitted.
-      world: compiled training scenes.
+      compiled_world: compiled training scenes.
       estimator_config: layout estimator.
       knowledge: knowledge from before training.
       console: console for progress.
     """
     fit = config.policy_method.fit
     assert fit is not None
-    world.check_method(config.policy_method, knowledge)
-    agent_loop = _make_fitted_loop(config, world.env, estimator_config)
-    env_params = world.make_env_params(0)
+    compiled_world.check_method(config.policy_method, knowledge)
+    agent_loop = _make_fitted_loop(config, compiled_world.env, estimator_config)
+    env_params = compiled_world.make_env_params(0)
     arm_key = jax.random.fold_in(jax.random.key(config.seed), ARM_KEY_PURPOSES["layout"])
     num_steps = config.total_updates * config.ppo.rollout
 
@@ -485,7 +487,9 @@ def fit_policies(
     for seed in range(config.seeds):
         with show_activity(console, f"fitting policy {seed + 1} of {config.seeds} to searches"):
             seed_key = jax.random.fold_in(arm_key, seed)
-            params = fit(agent_loop, world.banks[0], env_params, knowledge, seed_key, config.ppo.num_envs, num_steps)
+            params = fit(
+                agent_loop, compiled_world.banks[0], env_params, knowledge, seed_key, config.ppo.num_envs, num_steps
+            )
             fitted_params.append(jax.block_until_ready(params))
         console.print(f"policy {seed + 1} of {config.seeds}: fitted to {config.ppo.num_envs * num_steps:,} steps")
     return tuple(fitted_params)
@@ -499,7 +503,7 @@ def _make_fitted_loop(config: RunConfig, env: ObjectNav, estimator_config: Estim
 
 def _finish_fitted_run(
     config: RunConfig,
-    world: CompiledWorld,
+    compiled_world: CompiledWorld,
     preparation: Preparation,
     lock: FolderLock,
     stopwatch: "Stopwatch",
@@ -513,9 +517,9 @@ def _finish_fitted_run(
 
     # Success within budgets of actions; a finished run has it already.
     if config.validations and not (config.run_dir / REACH_FILE).exists():
-        agent_loop = _make_fitted_loop(config, world.env, estimator_config)
+        agent_loop = _make_fitted_loop(config, compiled_world.env, estimator_config)
         try:
-            validator = Validator(config, agent_loop, knowledge, world, console)
+            validator = Validator(config, agent_loop, knowledge, compiled_world, console)
         except MissingSplitError as error:
             console.print(f"no val scenes, so the policies are not measured ({error})")
         else:
@@ -632,7 +636,7 @@ def _restore_or_init(
 
 
 def _make_validator(
-    config: RunConfig, trainer: Trainer, knowledge: Knowledge, world: CompiledWorld, console: PlainConsole
+    config: RunConfig, trainer: Trainer, knowledge: Knowledge, compiled_world: CompiledWorld, console: PlainConsole
 ) -> Validator | None:
     """Validator of the policies; None without validations or val scenes."""
     if not config.validations:
@@ -641,7 +645,7 @@ def _make_validator(
     arm = "layout" if "layout" in config.arms else "baseline"
     agent_loop = trainer.learners[arm].agent_loop
     try:
-        return Validator(config, agent_loop, knowledge, world, console)
+        return Validator(config, agent_loop, knowledge, compiled_world, console)
     except MissingSplitError as error:
         console.print(f"no val scenes, so the policies of the last update are exported ({error})")
         return None
@@ -655,7 +659,7 @@ class TrainingSession:
       config: configuration of the run.
       trainer: trainer of all arms and seeds.
       validator: measures policies in val scenes; None without such scenes.
-      world: compiled training scenes.
+      compiled_world: compiled training scenes.
       bank_order: index of the bank of scenes of every chunk.
       manifest: identity of the run in its checkpoints.
       lock: lock of the run directory.
@@ -667,7 +671,7 @@ class TrainingSession:
     config: RunConfig
     trainer: Trainer
     validator: Validator | None
-    world: CompiledWorld
+    compiled_world: CompiledWorld
     bank_order: Sequence[int]
     manifest: dict[str, Any]
     lock: FolderLock
@@ -689,7 +693,7 @@ def run_updates(session: TrainingSession, states: TrainerStates, update: int) ->
     stage_by_chunk = config.stage_by_chunk
     validation_updates = config.validation_updates
     remaining_chunks = range(update // config.chunk, len(bank_order))
-    params_by_chunk = prefetch_env_params(session.world, [bank_order[chunk] for chunk in remaining_chunks])
+    params_by_chunk = prefetch_env_params(session.compiled_world, [bank_order[chunk] for chunk in remaining_chunks])
 
     with ProgressDisplay(config, update, session.console) as progress, Interrupts() as interrupts:
         for chunk_index, env_params in zip(remaining_chunks, params_by_chunk, strict=True):

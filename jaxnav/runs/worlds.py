@@ -98,9 +98,9 @@ def compile_training_world(config: RunConfig, console: Console) -> CompiledWorld
     """Compile the training scenes of a run."""
     console = to_plain_console(console)
     scenes = _load_scenes(config, config.world, "train", config.scenes, config.worlds.shift, console)
-    world = _compile_world(config, scenes, {}, config.train_step_limit, console)
+    compiled_world = _compile_world(config, scenes, {}, config.train_step_limit, console)
     has_expert = config.ppo.has_guidance or any(stage.uses_expert for stage in config.stages)
-    return dataclasses.replace(world, has_expert=has_expert)
+    return dataclasses.replace(compiled_world, has_expert=has_expert)
 
 
 def compile_sample_bank(config: RunConfig) -> Bank:
@@ -300,18 +300,18 @@ def concatenate_worlds(worlds: Sequence[CompiledWorld]) -> CompiledWorld:
     )
 
 
-def draw_episode_lists(world: CompiledWorld, num_episodes: int, seed: int) -> list[EpisodeList]:
+def draw_episode_lists(compiled_world: CompiledWorld, num_episodes: int, seed: int) -> list[EpisodeList]:
     """Draw fixed episodes, equally many in every bank of scenes."""
-    episodes_per_bank = -(-num_episodes // len(world.banks))  # rounded up
-    return [draw_episodes(bank, episodes_per_bank, seed, index) for index, bank in enumerate(world.banks)]
+    episodes_per_bank = -(-num_episodes // len(compiled_world.banks))  # rounded up
+    return [draw_episodes(bank, episodes_per_bank, seed, index) for index, bank in enumerate(compiled_world.banks)]
 
 
-def draw_bank_order(world: CompiledWorld, seed: int, num_turns: int) -> list[int]:
+def draw_bank_order(compiled_world: CompiledWorld, seed: int, num_turns: int) -> list[int]:
     """Draw the index of the bank for every turn of training.
 
     Passes over all banks follow one another, each in an order of its own.
     """
-    num_banks = len(world.banks)
+    num_banks = len(compiled_world.banks)
     num_passes = -(-num_turns // num_banks)  # rounded up
     order: list[int] = []
     for pass_index in range(num_passes):
@@ -319,17 +319,17 @@ def draw_bank_order(world: CompiledWorld, seed: int, num_turns: int) -> list[int
     return order[:num_turns]
 
 
-def prefetch_env_params(world: CompiledWorld, order: Sequence[int]) -> Iterator[EnvParams]:
+def prefetch_env_params(compiled_world: CompiledWorld, order: Sequence[int]) -> Iterator[EnvParams]:
     """Yield the environment's parameters with one bank after another, and read the next bank meanwhile."""
     if not order:
         return
     with ThreadPoolExecutor(1) as thread_pool:
         # One thread reads the next bank while the caller uses this one.
-        pending_params = thread_pool.submit(world.make_env_params, order[0])
+        pending_params = thread_pool.submit(compiled_world.make_env_params, order[0])
         for turn_index, bank_index in enumerate(order):
             params = pending_params.result()
 
             # A bank that comes again in the next turn stays.
             if turn_index + 1 < len(order) and order[turn_index + 1] != bank_index:
-                pending_params = thread_pool.submit(world.make_env_params, order[turn_index + 1])
+                pending_params = thread_pool.submit(compiled_world.make_env_params, order[turn_index + 1])
             yield params

@@ -118,12 +118,12 @@ class ShiftedEpisodes(NamedTuple):
     """Episodes of an evaluation in scenes with one layout shift.
 
     Attributes:
-      world: compiled scenes.
+      compiled_world: compiled scenes.
       episodes: E episodes with the lengths of shortest paths in these scenes.
       shift: layout shift of the scenes, from 0 to 1.
     """
 
-    world: CompiledWorld
+    compiled_world: CompiledWorld
     episodes: EpisodeList
     shift: float
 
@@ -190,7 +190,7 @@ def play_episode(
         with show_activity(
             console, f"playing {len(played_indices):,} episode{plural} at shift {shift_episodes.shift:g}"
         ):
-            traces = replay_episodes(policies, shift_episodes.world, compared_episodes, row)
+            traces = replay_episodes(policies, shift_episodes.compiled_world, compared_episodes, row)
 
         suffix = f", {VARIANT_CAPTIONS[variant]}" if len(variants) > 1 else ""
         success_by_name[f"shift {shift_episodes.shift:g}{suffix}"] = [trace.success for trace in traces]
@@ -310,11 +310,11 @@ def _make_played_episode(
 ) -> PlayedEpisode:
     """Combine a trace with the scene and the tables of its episode."""
     # The cell of each pose, counted from the first cell of the scene, [T].
-    bank = shifted.world.banks[0]
+    bank = shifted.compiled_world.banks[0]
     episodes = shifted.episodes
     scene_index = episodes.scene[index]
     scene_name = bank.names[scene_index]
-    scene = find_scenes(shifted.world, [scene_name])[scene_name]
+    scene = find_scenes(shifted.compiled_world, [scene_name])[scene_name]
     visited_cells = trace.pose // bank.task.rules.poses_per_cell - bank.first_cell[scene_index]
     return PlayedEpisode(
         trace=trace,

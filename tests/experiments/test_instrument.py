@@ -49,9 +49,9 @@ def succeed(rows, policies, world, num_episodes, seed):
 @pytest.mark.slow
 def test_agents_that_always_succeed_have_a_success_of_100_percent(drawn_run, monkeypatch):
     monkeypatch.setattr("jaxnav.experiments.instrument.evaluate_rows", succeed)
-    world = compile_evaluation_world(drawn_run.config, "val", None, 0.0, Console(quiet=True))
+    compiled_world = compile_evaluation_world(drawn_run.config, "val", None, 0.0, Console(quiet=True))
     policies = load_policies(drawn_run.config, ("baseline",))
-    totals = measure_scenes(world, policies, policies, num_episodes=24, seed=0)
+    totals = measure_scenes(compiled_world, policies, policies, num_episodes=24, seed=0)
 
     # Some four episodes a scene, so sums and means of the scenes differ.
     for measure in (*BASELINE_MEASURES, "layout_blind_argmax_sr", "layout_blind_sample_sr"):
@@ -72,8 +72,10 @@ def test_scenes_whose_goals_are_never_detected_do_not_count(drawn_run, monkeypat
         return measures._replace(succeeds=succeeds)
 
     monkeypatch.setattr(instrument, "_measure_bank", measure_bank)
-    world = compile_evaluation_world(drawn_run.config, "val", None, 0.0, Console(quiet=True))
-    totals = measure_scenes(world, load_policies(drawn_run.config, ("baseline",)), None, num_episodes=24, seed=0)
+    compiled_world = compile_evaluation_world(drawn_run.config, "val", None, 0.0, Console(quiet=True))
+    totals = measure_scenes(
+        compiled_world, load_policies(drawn_run.config, ("baseline",)), None, num_episodes=24, seed=0
+    )
     assert totals.weights["done_succeeds"][0] == 0 < totals.weights["goal_detected"][0]
     assert totals.values["done_succeeds"].sum() / totals.weights["done_succeeds"].sum() == 50.0
 

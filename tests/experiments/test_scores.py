@@ -347,8 +347,8 @@ def test_frontier_rows_are_searches_of_the_same_episodes(make_bench, drawn_run):
     bench = make_bench(shifts=(0.0, 1.0))
     table = ResultTable(measure_frontier(bench, bench.find_run("rooms", "main")))
     for shift in (0.0, 1.0):
-        world = compile_evaluation_world(drawn_run.config, "val", None, shift, QUIET)
-        bank = world.banks[0]
+        compiled_world = compile_evaluation_world(drawn_run.config, "val", None, shift, QUIET)
+        bank = compiled_world.banks[0]
         # Living rooms have 14 actions, all others 12.
         limits = np.array([14 if room == "living_room" else 12 for room in bank.room_types])
         searched = run_frontier_search(bank, draw_episodes(bank, 24), limits)

@@ -192,5 +192,5 @@ def test_a_game_has_the_views_that_its_policy_was_trained_with(tmp_path):
     write_scenes(scenes, [make_generated_scenes("houses", "val", 1)[0]])
     game = prepare_game(PlayConfig("houses", scenes=scenes, policy=str(EARLIER_POLICY)), Console(quiet=True))
     assert game.policy is not None
-    assert game.world.env.task.rules == game.policy.task.rules
-    assert game.world.env.task.rules.front_cell == "nearest"
+    assert game.compiled_world.env.task.rules == game.policy.task.rules
+    assert game.compiled_world.env.task.rules.front_cell == "nearest"

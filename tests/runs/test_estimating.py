@@ -99,26 +99,26 @@ def test_with_inner_steps_refuses_more_steps_than_the_method_adapts(drawn_run):
         InputError, match=r"^inner_steps is 5, but an episode stores 4 windows of 6 actions; give 0 to 4$"
     ):
         adaptive.with_inner_steps(5)
-    world = compile_evaluation_world(drawn_run.config, "val", None, None, Console(quiet=True))
-    assert adaptive.with_inner_steps(0).make_agent_loop(world).inner_steps == 0
-    assert adaptive.make_agent_loop(world).inner_steps is None
+    compiled_world = compile_evaluation_world(drawn_run.config, "val", None, None, Console(quiet=True))
+    assert adaptive.with_inner_steps(0).make_agent_loop(compiled_world).inner_steps == 0
+    assert adaptive.make_agent_loop(compiled_world).inner_steps is None
 
 
 @pytest.mark.slow
 def test_semexp_refuses_scenes_larger_than_its_map_at_every_entry_point(drawn_run):
     """A map of 12 lines holds a cell and the 11 of a view."""
-    world = compile_evaluation_world(drawn_run.config, "val", None, None, Console(quiet=True))
+    compiled_world = compile_evaluation_world(drawn_run.config, "val", None, None, Console(quiet=True))
     policies = drawn_run.policies()
     searching = policies._replace(
         spec=dataclasses.replace(policies.spec, method=METHODS["semexp"]),
         knowledge=policies.knowledge._replace(method={"lines": jnp.arange(12)}),
     )
-    subject = EvaluatedRun(searching, world, draw_episodes(world.banks[0], 4))
+    subject = EvaluatedRun(searching, compiled_world, draw_episodes(compiled_world.banks[0], 4))
     row = table_row("baseline", None, None, "argmax")
     for act in (
-        lambda: searching.make_agent_loop(world),
-        lambda: evaluate_rows([row], searching, world, 4, 0),
-        lambda: replay_episodes(searching, world, subject.episodes, row),
+        lambda: searching.make_agent_loop(compiled_world),
+        lambda: evaluate_rows([row], searching, compiled_world, 4, 0),
+        lambda: replay_episodes(searching, compiled_world, subject.episodes, row),
         lambda: TrialRunner(seed=0).run_trials(subject, None, [Trial("baseline", "argmax")]),
     ):
         with pytest.raises(InputError, match=r"needs a map of .* cells, but the map of the training homes has 12"):
@@ -127,9 +127,9 @@ def test_semexp_refuses_scenes_larger_than_its_map_at_every_entry_point(drawn_ru
 
 @pytest.mark.slow
 def test_pooled_prior_sums_the_counts_of_all_rooms(config):
-    world = compile_training_world(config, Console(quiet=True))
+    compiled_world = compile_training_world(config, Console(quiet=True))
     pooled = dataclasses.replace(config, layout=dataclasses.replace(config.layout, prior="pooled"))
-    by_room, whole = (np.asarray(explore_world(one_config, world).counts) for one_config in (config, pooled))
+    by_room, whole = (np.asarray(explore_world(one_config, compiled_world).counts) for one_config in (config, pooled))
     assert np.abs(by_room - by_room[0]).max() > 0  # rooms differ
     for room in whole:
         np.testing.assert_allclose(room, by_room.sum(axis=0))

@@ -115,17 +115,17 @@ def test_count_array_bytes_counts_arrays_and_random_keys():
 @pytest.mark.slow
 def test_estimated_states_have_the_size_of_the_states(tmp_path):
     config = tiny_config(tmp_path)
-    world = compile_training_world(config, PlainConsole(quiet=True))
+    compiled_world = compile_training_world(config, PlainConsole(quiet=True))
     estimator_config = ESTIMATORS["calibrated"]
-    knowledge = learn_knowledge(config, world, explore_world(config, world), estimator_config)
-    env_params = world.make_env_params(0)
-    trainer = make_trainer(config, world.env, estimator_config, knowledge)
+    knowledge = learn_knowledge(config, compiled_world, explore_world(config, compiled_world), estimator_config)
+    env_params = compiled_world.make_env_params(0)
+    trainer = make_trainer(config, compiled_world.env, estimator_config, knowledge)
     num_bytes = trainer.estimate_state_bytes(env_params)
     assert num_bytes == count_array_bytes(trainer.init(env_params))
 
     # One device of a mesh holds all states.
     mesh = Devices(count=1).mesh(config.seeds, config.ppo.num_envs, config.ppo.minibatches)
-    sharded_trainer = make_trainer(config, world.env, estimator_config, knowledge, mesh)
+    sharded_trainer = make_trainer(config, compiled_world.env, estimator_config, knowledge, mesh)
     assert sharded_trainer.estimate_state_bytes(env_params) == num_bytes
 
 

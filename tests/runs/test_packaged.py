@@ -124,6 +124,6 @@ def test_policies_refuse_scenes_of_other_rules(tmp_path):
     write_scenes(scenes, [make_generated_scenes("houses", "val", 1)[0]])
     _, policies = load_policy_as_run("houses-org")
     config = jaxnav.RunConfig(world="houses", worlds=WorldConfig(front_cell="nearest"))
-    world = compile_evaluation_world(config, "val", scenes, 0.0, Console(quiet=True))
+    compiled_world = compile_evaluation_world(config, "val", scenes, 0.0, Console(quiet=True))
     with pytest.raises(InputError, match=r"other rules .* front_cell: 'move' != 'nearest'; .* --worlds.front-cell"):
-        policies.make_agent_loop(world)
+        policies.make_agent_loop(compiled_world)

@@ -83,21 +83,23 @@ def paper_world() -> PaperWorld:
     worlds = dataclasses.replace(config.worlds, num_train=4)
     config = check_config(dataclasses.replace(config, layout=layout, worlds=worlds))
     console = PlainConsole(quiet=True)
-    world = compile_training_world(config, console)
-    exploration = training.explore_world(config, world)
-    estimator = training.calibrate_estimator(config, world, exploration, console)
-    knowledge = training.learn_knowledge(config, world, exploration, estimator)
+    compiled_world = compile_training_world(config, console)
+    exploration = training.explore_world(config, compiled_world)
+    estimator = training.calibrate_estimator(config, compiled_world, exploration, console)
+    knowledge = training.learn_knowledge(config, compiled_world, exploration, estimator)
 
     # The random walks: starts and actions by the keys of the run.
     run_key = jax.random.fold_in(jax.random.key(config.seed), training._EXPLORE)
     start_key, action_key = (jax.random.fold_in(jax.random.fold_in(run_key, 0), purpose) for purpose in (0, 1))
-    env_params = world.make_env_params(0)
-    _, state = jax.vmap(world.env.reset, (0, None))(jax.random.split(start_key, 24), env_params)
+    env_params = compiled_world.make_env_params(0)
+    _, state = jax.vmap(compiled_world.env.reset, (0, None))(jax.random.split(start_key, 24), env_params)
     actions = np.asarray(jax.random.randint(action_key, (40, 24), 0, DONE))
 
-    perception = Perception(world.env.row_format, config.policy_spec(NUM_CATEGORIES), estimator)
+    perception = Perception(compiled_world.env.row_format, config.policy_spec(NUM_CATEGORIES), estimator)
     start_poses = np.asarray(state.pose)
-    return PaperWorld(config, world.banks[0], env_params, perception, estimator, knowledge, start_poses, actions)
+    return PaperWorld(
+        config, compiled_world.banks[0], env_params, perception, estimator, knowledge, start_poses, actions
+    )
 
 
 def instance_counts(row: np.ndarray) -> np.ndarray:

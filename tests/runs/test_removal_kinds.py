@@ -82,11 +82,11 @@ def test_rows_are_named_after_their_causal_quantity(results):
 
 @pytest.mark.slow
 def test_cde_leaves_the_policy_without_experience_in_a_replay(run, results):
-    world = compile_evaluation_world(run.config, "val", None, None, Console(quiet=True))
+    compiled_world = compile_evaluation_world(run.config, "val", None, None, Console(quiet=True))
     policies = run.policies()
     row = next(row for row in results.rows if row.variant == "cde" and row.decoding == "argmax")
     episodes = results.episodes.take(np.arange(4))
-    traces = replay_episodes(policies, world, episodes, row)
+    traces = replay_episodes(policies, compiled_world, episodes, row)
     expected_length = outcome_of(results, "cde").length[0, :4]
     np.testing.assert_array_equal([len(trace.action) for trace in traces], expected_length)
 
@@ -106,10 +106,10 @@ def test_counterfactual_memory_changes_only_rows_with_counterfactual_logits(run,
 @pytest.mark.slow
 def test_loaded_policy_carries_both_memories(run):
     policy = jaxnav.load_policy(run.config.run_dir / "policies" / "layout-0")
-    world = compile_evaluation_world(run.config, "val", None, None, Console(quiet=True))
-    env_params = world.make_env_params(0)
-    _, state = world.env.reset(jax.random.key(0), env_params)
-    observation = world.env.observe(state, env_params)
+    compiled_world = compile_evaluation_world(run.config, "val", None, None, Console(quiet=True))
+    env_params = compiled_world.make_env_params(0)
+    _, state = compiled_world.env.reset(jax.random.key(0), env_params)
+    observation = compiled_world.env.observe(state, env_params)
     decide = jax.jit(policy.decide)
 
     # The first counterfactual decision follows from two empty memories, the next one from two different ones.

@@ -45,11 +45,11 @@ def test_exported_stream_policy_acts(drawn_run, streams, tmp_path):
     policy = jaxnav.load_policy(tmp_path / "policy")
     assert policy.spec == streams.policy_spec(len(streams.task.categories))
     chex.assert_trees_all_equal(policy.params, params)
-    world = compile_evaluation_world(streams, "val", None, None, Console(quiet=True))
-    _, state = world.env.reset(jax.random.key(0), world.make_env_params(0))
-    observation = world.env.observe(state, world.make_env_params(0))
+    compiled_world = compile_evaluation_world(streams, "val", None, None, Console(quiet=True))
+    _, state = compiled_world.env.reset(jax.random.key(0), compiled_world.make_env_params(0))
+    observation = compiled_world.env.observe(state, compiled_world.make_env_params(0))
     action, memory = jax.jit(policy.act)(observation, policy.init(), heading=0, moved=False)
-    assert 0 <= int(action) < world.env.num_actions
+    assert 0 <= int(action) < compiled_world.env.num_actions
     np.testing.assert_array_equal(memory.policy_state.use_experience, 1.0)
 
 

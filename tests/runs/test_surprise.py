@@ -104,20 +104,22 @@ def count_in_the_world(poses, bank, centres, task, near_log_odds):
 
 @pytest.mark.slow
 def test_surprise_of_played_episodes_is_that_of_the_world(drawn_run, policies):
-    world = compile_evaluation_world(drawn_run.config, "val", None, None, Console(quiet=True))
-    bank = world.banks[0]
-    scenes = {world.scenes[index].name: world.scenes[index] for index in range(len(world.scenes))}
+    compiled_world = compile_evaluation_world(drawn_run.config, "val", None, None, Console(quiet=True))
+    bank = compiled_world.banks[0]
+    scenes = {
+        compiled_world.scenes[index].name: compiled_world.scenes[index] for index in range(len(compiled_world.scenes))
+    }
     all_centres = [cell_centres(scenes[name], standable_cells(scenes[name].reach)) for name in bank.names]
     centres = np.concatenate(all_centres)
 
     surprised = policies.with_estimator("surprise")
     episodes = draw_episodes(bank, 8)
-    traces = replay_episodes(surprised, world, episodes, table_row("stde", 0.5, "residual", "sample"))
+    traces = replay_episodes(surprised, compiled_world, episodes, table_row("stde", 0.5, "residual", "sample"))
     num_views = 0
     for trace, scene in zip(traces, episodes.scene, strict=True):
-        room = world.make_env_params(0).room[scene]
+        room = compiled_world.make_env_params(0).room[scene]
         near_log_odds = policies.knowledge.cooccurrence.near_log_odds[room]
-        expected = count_in_the_world(trace.pose.tolist(), bank, centres, world.env.task, near_log_odds)
+        expected = count_in_the_world(trace.pose.tolist(), bank, centres, compiled_world.env.task, near_log_odds)
         # A pair at exactly 1, 2 or 4 m may be rounded to either side.
         np.testing.assert_allclose(trace.gap, expected, atol=2e-4)
         num_views += len(trace.pose)

@@ -42,8 +42,8 @@ def validated(drawn_run):
 def test_validator_equals_evaluation_on_the_same_episodes(validated):
     config, policies, validator, held = validated
     rows = [EvaluationRow(arm, None, None, decoding) for arm in policies.arms for decoding in DECODINGS]
-    world = compile_evaluation_world(config, "val", None, None, QUIET)
-    _, outcome, _ = evaluate_rows(rows, policies, world, config.val_episodes, 2**32)
+    compiled_world = compile_evaluation_world(config, "val", None, None, QUIET)
+    _, outcome, _ = evaluate_rows(rows, policies, compiled_world, config.val_episodes, 2**32)
     scores = validator.measure(held)
     for row, success, done in zip(rows, np.asarray(outcome.success), np.asarray(outcome.done), strict=True):
         if row.decoding == "sample":

@@ -137,5 +137,5 @@ def test_impossible_weights_are_refused_in_one_line(options, message):
 @pytest.mark.parametrize("guidance", [0.0, 0.1])
 def test_tables_hold_shortest_paths_only_where_training_reads_them(guidance):
     config = RunConfig(worlds=WorldConfig(num_train=4), ppo=PPOConfig(guidance=guidance))
-    world = compile_training_world(config, Console(quiet=True))
-    assert world.has_expert == (guidance > 0)
+    compiled_world = compile_training_world(config, Console(quiet=True))
+    assert compiled_world.has_expert == (guidance > 0)
