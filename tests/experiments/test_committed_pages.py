@@ -89,12 +89,11 @@ def test_committed_results_are_written_as_they_were_read(name, tmp_path):
         assert json.loads(new_head)["shared"] == json.loads(head)["shared"]
 
 
-#: Experiments with pages of the templates that the fast cases, `claims` and `factors`, lack.
-OTHER_TEMPLATES = ["table2", "table3", "study_rooms", "accounts", "removal_houses"]
+#: Experiments whose pages have between them all templates of tables.
+SEVERAL_TEMPLATES = ["claims", "streams", "table2", "table3", "study_rooms", "accounts", "removal_houses"]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", params_by_tier(COMMITTED, fast=["claims", "streams"], slow=OTHER_TEMPLATES))
+@pytest.mark.parametrize("name", params_by_tier(COMMITTED, slow=SEVERAL_TEMPLATES))
 def test_pages_can_be_written_from_the_first_result_on(name, tmp_path):
     """Pages are written after every part, so that an interrupted experiment has them."""
     config = dataclasses.replace(copy_documents(COMMITTED[name], tmp_path), results=tmp_path / "results")

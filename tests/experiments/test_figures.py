@@ -10,7 +10,6 @@ from matplotlib.collections import FillBetweenPolyCollection, LineCollection, Pa
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from PIL import Image
-from support.tiers import params_by_tier
 
 from jaxnav.choices import Form
 from jaxnav.evaluation.statistics import Interval
@@ -217,7 +216,7 @@ def test_the_effects_figure_fills_markers_whose_interval_excludes_zero():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", params_by_tier(DRAWINGS, fast=["epsilon"], slow=DRAWINGS))
+@pytest.mark.parametrize("name", DRAWINGS)
 def test_equal_data_gives_equal_bytes(name, tmp_path):
     figure = DRAWINGS[name]()
     paths = [tmp_path / file for file in ("first.png", "again.png", "redrawn.png")]
@@ -231,7 +230,7 @@ def test_equal_data_gives_equal_bytes(name, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", params_by_tier(DRAWINGS, fast=["epsilon"], slow=DRAWINGS))
+@pytest.mark.parametrize("name", DRAWINGS)
 def test_all_text_is_inside_the_figure(name):
     figure = DRAWINGS[name]()
     box = figure.get_tightbbox()  # inches

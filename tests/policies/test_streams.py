@@ -114,7 +114,6 @@ def assert_bit_identical(actual, desired):
 # Equations 1 and 2
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("method_name", params_by_tier(HOSTS, slow=["anonymous", "org", "support.methods:ADAPTIVE"]))
 def test_tde_of_streams_is_bit_identical_to_the_direct_stream(method_name):
     for seed in range(4):
@@ -128,7 +127,6 @@ def test_tde_of_streams_is_bit_identical_to_the_direct_stream(method_name):
         assert np.std(decisions.counterfactual.logits) > 0.1
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("method_name", params_by_tier(HOSTS, slow=["rgb", "org"]))
 def test_stde_of_streams_keeps_a_share_of_the_experience_stream(method_name):
     decisions = random_decisions(make_spec(method_name), seed=5)

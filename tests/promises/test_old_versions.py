@@ -203,7 +203,6 @@ def decide_once(policy: jaxnav.LoadedPolicy) -> jax.Array:
     return policy.decide(observation, policy.init("kitchen"), heading=0, moved=False, horizon=0).logits
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("method", params_by_tier(["rgb", "anonymous", "sp"], slow=["rgb"]))
 def test_policies_of_0_3_of_other_methods_keep_their_meaning(tmp_path, method):
     folder = export_tiny_policy(tmp_path / "raw", method, "raw")

@@ -16,7 +16,6 @@ import pytest
 from support.commands import evaluate, refusal, train
 from support.path_names import NAMES
 from support.refusals import assert_message_names
-from support.tiers import params_by_tier
 from support.tiny_run import write_config
 
 import jaxnav
@@ -33,7 +32,7 @@ STATE = {"weights": jnp.arange(3.0)}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", params_by_tier(NAMES, fast=NAMES[::6], slow=NAMES), ids=ascii)
+@pytest.mark.parametrize("name", NAMES, ids=ascii)
 def test_checkpoints_are_stored_in_a_run_directory_of_any_name(name, tmp_path, monkeypatch):
     # The working directory has the name, too.
     working_dir = tmp_path / name

@@ -5,7 +5,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from support.tiers import params_by_tier
 
 from jaxnav.__main__ import COMMANDS
 
@@ -48,7 +47,7 @@ DRAWING_COMMANDS = ["episode run", "report run", "scenes show rooms", "study stu
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", params_by_tier(DRAWING_COMMANDS, fast=DRAWING_COMMANDS[:1], slow=DRAWING_COMMANDS))
+@pytest.mark.parametrize("command", DRAWING_COMMANDS)
 def test_drawing_command_is_refused_without_extras(tmp_path, command):
     script = f"from jaxnav.__main__ import main\nsys.exit(main({command.split()}))"
     done = without_pictures(script, tmp_path)

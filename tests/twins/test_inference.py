@@ -204,10 +204,9 @@ def test_every_decision_is_the_twins(method, decision, count):
     assert removals > 0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "weight_kind"),
-    params_by_tier([(name, "relative") for name in ("org", "eotp", "semexp", "vtnet")], fast=[("org", "relative")]),
+    params_by_tier([(name, "relative") for name in ("org", "eotp", "semexp", "vtnet")], slow=[("org", "relative")]),
 )
 def test_decisions_with_scaled_weights_are_the_twins(method, weight_kind):
     row = table_row("stde", 0.0, "paper", "argmax")
