@@ -107,7 +107,7 @@ def test_interrupts_keep_an_ignored_signal_ignored():
         assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_signal_during_the_last_save_is_reported(tmp_path, capsys, monkeypatch):
     """The run is saved and not exported; the same command exports it."""
     config_file = write_config(tmp_path)

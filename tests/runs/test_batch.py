@@ -76,7 +76,7 @@ def test_a_run_of_a_batch_is_the_run_that_train_gives(tmp_path):
         jaxnav.Run.open(config.run_dir).policies()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_batch_of_one_run_is_not_the_run_without_its_setting(tmp_path):
     config = tiny_config(tmp_path, arms=("layout",), counterfactual="none")
     train_batch(config, learning_rate=[3e-2])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.commands import refusal, train
 from support.processes import REPOSITORY, run
+from support.tiers import params_by_tier
 from support.tiny_run import write_config
 
 from jaxnav.training.devices import Devices
@@ -85,8 +86,7 @@ def distance(a, b):
     return np.abs(np.subtract(a["params"], b["params"])).max()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("devices", [2, 4])
+@pytest.mark.parametrize("devices", params_by_tier([2, 4], slow=[2]))
 def test_any_number_of_devices_trains_the_same_policies(devices):
     result = trained(1, 4) | (trained(devices) if devices != 4 else {})
     for ours, theirs in zip(result["1"], result[str(devices)], strict=True):
