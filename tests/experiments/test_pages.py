@@ -434,13 +434,14 @@ def mixture_rows(world: str) -> list[ResultRow]:
             rows.append(make_row(lead, **fields, **lead_fields))
         rows.append(make_row(20.0, **sampled, shift=shift, variant="without removal", metric="length"))
 
-        # TDE keeps a third of the value, and leaves a quarter of the cost.
+        # TDE keeps a third of the value, and leaves a quarter of the cost; in SPL no share can be told.
         share = 33.0 if shift == 0.0 else 25.0
         rows.append(make_row(1.0, **sampled, shift=shift, variant="TDE", metric="weight"))
         for metric in ("sr", "spl", "sr@40"):
             tde = {**sampled, "variant": "TDE", "shift": shift}
             rows.append(make_row(lead * (share / 100 - 1), **tde, reference="without removal", metric=metric))
-            rows.append(make_row(share, **tde, metric=f"{metric} remaining"))
+            if metric != "spl":
+                rows.append(make_row(share, **tde, metric=f"{metric} remaining"))
     return rows
 
 
@@ -449,7 +450,7 @@ def test_removal_keeps_value_and_recovers_cost(tmp_path):
     value = read_lines(text.split("### Value and cost of experience")[1])["its value (or cost)"]
     assert value == ["+6.0 [-]"] * 3 + ["-4.0 [-]"] * 3
 
-    # One table per measure: weights, changes at both shifts and over the mixture, value kept and cost recovered.
+    # One table per measure: weights, changes at both shifts and over the mixture, and shares where there are any.
     text_of_removals = text.split("### Every removal")[1]
     for title, shares in (("SR within 40 actions", ["33", "75"]), ("SR", ["33", "75"]), ("SPL", [])):
         weights, *cells = read_lines(text_of_removals.split(f"**{title}**")[1])["TDE"]
