@@ -493,10 +493,10 @@ def make_agent_rows(world: str, run: str, **sr: float) -> list[ResultRow]:
     return rows
 
 
-def make_effect(world: str, run: str, variant: str, reference: str, effect: Interval) -> ResultRow:
+def make_effect(world: str, run: str, variant: str, reference: str, effect: Interval, metric: str = "sr") -> ResultRow:
     stde = {"epsilon": 0.5, "form": "residual"} if variant == "stde" and run not in ("hosts",) else {}
     fields = {"variant": variant, "decoding": "argmax", "reference": reference, "shift": 0.0, **stde}
-    return make_row(effect, world=world, run=run, **fields)
+    return make_row(effect, world=world, run=run, metric=metric, **fields)
 
 
 def test_orderings_are_judged_by_their_intervals(tmp_path):
@@ -515,17 +515,25 @@ def test_orderings_are_judged_by_their_intervals(tmp_path):
 
     # The paper's means are over the methods that were run: (66.53 + 70.38) / 2 - 59.06 = 9.395, and
     # (59.06 + 66.53 + 70.38) / 3 - 4.68 = 60.643.
-    assert cells["rooms: methods over `rgb` (2 of 6)"] == ["+9.4", "+20.0 [+19.0, +21.0]", "holds"]
-    assert cells["rooms: methods over Random (3 of 8)"] == ["+60.6", "+68.0 [+67.0, +69.0]", "holds"]
+    assert cells["rooms: structured methods over `rgb` (2 of 6)"] == ["+9.4", "+20.0 [+19.0, +21.0]", "-", "holds"]
+    assert cells["rooms: methods over Random (3 of 8)"] == ["+60.6", "+68.0 [+67.0, +69.0]", "-", "holds"]
 
     # Hosts: what the paper's Table 1 says of ORG, 71.40 - 66.48, its Table 2, 74.85 - 66.53, and 71.40 - 69.24.
-    assert cells["rooms: `org` + w over `org`"] == ["+4.9", "+5.0 [+4.0, +6.0]", "holds"]
-    assert cells["rooms: `org` + w + sTDE over `org`"][1:] == ["+0.5 [-0.5, +1.5]", "excluded"]
-    assert cells["rooms: `org` + w over `org` + w + TDE"] == ["+2.2", "-5.0 [-6.0, -4.0]", "refuted"]
-    assert cells["rooms: `hoz` + w over `hoz`"][1:] == ["+1.0 [-2.0, +4.0]", "inconclusive"]
+    assert cells["rooms: `org` + w over `org`"] == ["+4.9", "+5.0 [+4.0, +6.0]", "-", "holds"]
+    assert cells["rooms: `org` + w + sTDE over `org`"][1:] == ["+0.5 [-0.5, +1.5]", "-", "excluded"]
+    assert cells["rooms: `org` + w over `org` + w + TDE"] == ["+2.2", "-5.0 [-6.0, -4.0]", "-", "refuted"]
+    assert cells["rooms: `hoz` + w over `hoz`"][1:] == ["+1.0 [-2.0, +4.0]", "-", "inconclusive"]
+
+    # Effects on SPL have a column, too.
+    changes = {"sr": -5.0, "spl": -3.0}
+    spl_rows = [
+        make_effect("rooms", "org", "tde", "layout", make_interval(mean), metric) for metric, mean in changes.items()
+    ]
+    spl_cells = read_lines(render_paper(tmp_path, *make_agent_rows("rooms", "org", baseline=80.0), *spl_rows))
+    assert spl_cells["rooms: `org` + w over `org` + w + TDE"][2] == "+3.0 [+2.0, +4.0]"
 
     # What has no results is not judged.
-    assert cells["rooms: `eotp` + w over `eotp`"][1:] == ["-", "not run"]
+    assert cells["rooms: `eotp` + w over `eotp`"][1:] == ["-", "-", "not run"]
     assert cells["apartments: all"][-1] == cells["gains of hosts: apartments over rooms"][-1] == "not run"
 
 
@@ -621,8 +629,8 @@ def test_gains_of_worlds_are_compared_by_both_intervals(tmp_path):
 
     # Both widths add up to 2. The paper's hosts gain (8.53 + 9.63 + 9.91 + 9.86) / 4 = 9.4825 in RoboTHOR and
     # (4.01 + 8.32 + 5.15 + 4.67) / 4 = 5.5375 in AI2-THOR, its SemExp 1.61.
-    assert cells["gains of hosts: apartments over rooms"] == ["+3.9", "+5.0 [+3.0, +7.0]", "holds"]
-    assert cells["gains: hosts in rooms over `semexp` in houses"] == ["+3.9", "+5.0 [+3.0, +7.0]", "holds"]
+    assert cells["gains of hosts: apartments over rooms"] == ["+3.9", "+5.0 [+3.0, +7.0]", "-", "holds"]
+    assert cells["gains: hosts in rooms over `semexp` in houses"] == ["+3.9", "+5.0 [+3.0, +7.0]", "-", "holds"]
 
 
 def test_scenes_of_a_dataset_have_columns_beside_those_of_the_paper(tmp_path):
@@ -632,7 +640,7 @@ def test_scenes_of_a_dataset_have_columns_beside_those_of_the_paper(tmp_path):
     cells = read_lines(text.split("### Table 2: AI2-THOR")[1].split("###")[0])
     assert cells["`org`"] == ["66.53", "39.00", "0.54", "90.0 [-]", "-", "-", "88.0 [-]", "-", "-"]
     # The ordering is judged in these scenes, too, next to the gain of the paper's Table 1: 71.40 - 66.48.
-    assert read_lines(text)["ithor: `org` + w over `org`"] == ["+4.9", "+1.0 [-2.0, +4.0]", "inconclusive"]
+    assert read_lines(text)["ithor: `org` + w over `org`"] == ["+4.9", "+1.0 [-2.0, +4.0]", "-", "inconclusive"]
     # Datasets that were not run have neither columns nor lines.
     assert len(read_lines(text.split("### Table 2: RoboTHOR")[1].split("###")[0])["`org`"]) == 6
     assert not any(name.startswith("robothor") for name in read_lines(text))
