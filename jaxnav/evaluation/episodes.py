@@ -41,6 +41,11 @@ class EpisodeList(NamedTuple):
     scenes: tuple[str, ...]
 
     @property
+    def num_drawn_scenes(self) -> int:
+        """Number of scenes with episodes; few episodes leave some scenes without any."""
+        return len(np.unique(self.scene))
+
+    @property
     def floor_plans(self) -> np.ndarray:
         """Floor plan of each episode, [E]; see `floor_plan_name`."""
         plan_by_scene = np.array(list(map(floor_plan_name, self.scenes)))

@@ -6,6 +6,7 @@ Measurements ask a `Bench` for what they need, and the bench trains, compiles or
 import hashlib
 import io
 import zipfile
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -200,6 +201,6 @@ def _load_outcomes(path: Path) -> list[EpisodeOutcome] | None:
             outcomes = []
             for index in range(num_outcomes):
                 outcomes.append(EpisodeOutcome(*(arrays[f"{index}.{field}"] for field in EpisodeOutcome._fields)))
-    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile):
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error):
         return None
     return outcomes

@@ -209,6 +209,7 @@ def check_experiment(config: ExperimentConfig) -> ExperimentConfig:
             if not any(_is_measured(run, (pattern,)) for run in runs):
                 raise InputError(f"measure.{measurement}: {pattern!r} matches no agent; give another")
     _check_seeds(runs)
+    _check_agents_of_folds(config, runs)
     for run in runs:
         if not isinstance(run.config.devices, int | None):
             raise InputError(f"{run.name}: devices is {run.config.devices}; one process trains all runs: give a number")
@@ -236,6 +237,19 @@ def _check_folds(config: ExperimentConfig) -> None:
     # Scenes of a fold that is listed twice would count twice.
     if len(set(all_folds)) < len(all_folds):
         raise InputError("folds: a world is listed twice; give each once")
+
+
+def _check_agents_of_folds(config: ExperimentConfig, runs: list[AgentRun]) -> None:
+    """Check that an agent is trained in all folds of a dataset, or in none."""
+    trained = {(run.world, run.agent) for run in runs}
+    for dataset, folds in config.folds.items():
+        for agent in config.agents:
+            missing_folds = [fold for fold in folds if (fold, agent) not in trained]
+            if 0 < len(missing_folds) < len(folds):
+                raise InputError(
+                    f"left_out: {agent} is left out in {', '.join(missing_folds)} of folds.{dataset}; leave it out in "
+                    "all folds of a dataset, or in none"
+                )
 
 
 def _check_seeds(runs: list[AgentRun]) -> None:

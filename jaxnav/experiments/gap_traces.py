@@ -79,7 +79,7 @@ def measure_gaps(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
 
     # Mean gap of every estimator and belief, and the share of the episodes behind each point of these curves.
     for shift, traces in zip(shifts, shift_traces, strict=True):
-        fields = {"world": run.world, "run": run.agent, "shift": shift, "scenes": len(traces.episodes.scenes)}
+        fields = {"world": run.world, "run": run.agent, "shift": shift, "scenes": traces.episodes.num_drawn_scenes}
         bounds = mean_by_step(traces)
         for (index, name), (belief, belief_index) in itertools.product(enumerate(estimators), BELIEFS.items()):
             curve = Curve(steps, *bounds[:, index, belief_index])

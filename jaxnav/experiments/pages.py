@@ -23,7 +23,7 @@ from jaxnav.evaluation.notes import MIN_OTHER_CATEGORIES_SHARE
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.experiments.bench import best_epsilon
 from jaxnav.experiments.config import AgentRun, ExperimentConfig, agent_runs, join_folds
-from jaxnav.experiments.scores import chooses_actions
+from jaxnav.experiments.scores import chooses_actions, list_comparisons
 from jaxnav.experiments.table import ResultTable, merge_fields
 from jaxnav.scenes.worlds import WORLDS
 from jaxnav.store.files import write_atomic
@@ -137,13 +137,13 @@ def _load_template(template: str) -> jinja2.Template:
         "verdict": verdict,
         "best_epsilon": best_epsilon,
         "chooses_actions": chooses_actions,
+        "list_comparisons": list_comparisons,
         "requested_steps": requested_steps,
         "total_steps": total_steps,
         "differ_only_in_layout": differ_only_in_layout,
         "difference_of_worlds": difference_of_worlds,
         "effect_cells": effect_cells,
         "merge": merge_fields,
-        "numbers": format_numbers,
         "shift_titles": shift_titles,
         "weights": format_weights,
     }
@@ -242,11 +242,6 @@ def verdict(effect: Interval, min_effect: float) -> str:
 def difference_of_worlds(first: Interval, second: Interval) -> Interval:
     """Difference of effects in independent worlds; bounds are added, so the interval is wider than needed."""
     return Interval(first.mean - second.mean, first.low - second.high, first.high - second.low)
-
-
-def format_numbers(values: Iterable[float]) -> list[str]:
-    """Format numbers without trailing zeros."""
-    return [f"{value:g}" for value in values]
 
 
 def shift_titles(shifts: Iterable[float]) -> list[str]:

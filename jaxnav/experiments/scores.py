@@ -17,7 +17,7 @@ from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList, join_episode_lists
 from jaxnav.evaluation.grid import episode_metrics
 from jaxnav.evaluation.notes import last_quarter_success
-from jaxnav.evaluation.report import UNTRAINED_VARIANTS, to_report_units
+from jaxnav.evaluation.report import METRIC_COLUMNS, UNTRAINED_VARIANTS, to_report_units
 from jaxnav.evaluation.statistics import Interval, mean_interval, paired_difference
 from jaxnav.evaluation.variants import EvaluationRow
 from jaxnav.experiments.bench import Bench, Scores
@@ -28,7 +28,6 @@ from jaxnav.policies.methods import find_method
 from jaxnav.runs.evaluate import draw_episode_lists, has_same_episodes, measure_leads
 from jaxnav.runs.run import Run
 
-METRICS = ("sr", "spl", "dts")
 #: Comparisons within a run: a variant and its reference.
 VARIANT_COMPARISONS = (("layout", "baseline"), ("stde", "layout"), ("stde", "baseline"), ("tde", "layout"))
 #: Variants that act by trained policies.
@@ -57,10 +56,10 @@ def value_rows(run: AgentRun, shift: float, scores: Scores) -> Iterator[ResultRo
     clusters = scores.episodes.clusters()
     for row, metrics in scores.metrics.items():
         is_trained = row.variant not in UNTRAINED_VARIANTS
-        for metric in METRICS:
+        for metric in METRIC_COLUMNS:
             interval = mean_interval(metrics[metric], clusters, trained=is_trained)
             yield ResultRow(
-                **row_fields(run, shift, row), metric=metric, value=interval, scenes=num_scenes(scores.episodes)
+                **row_fields(run, shift, row), metric=metric, value=interval, scenes=scores.episodes.num_drawn_scenes
             )
 
 
@@ -78,7 +77,7 @@ def share_rows(run: AgentRun, shift: float, scores: Scores) -> Iterator[ResultRo
             if interval is not None:
                 metric = f"{name} of {entry['part']}"
                 yield ResultRow(
-                    **fields, metric=metric, value=Interval.from_json(interval), scenes=num_scenes(scores.episodes)
+                    **fields, metric=metric, value=Interval.from_json(interval), scenes=scores.episodes.num_drawn_scenes
                 )
 
 
@@ -91,8 +90,7 @@ def difference_rows(
       run: the run.
       shift: layout shift.
       scores: scores of the run.
-      references: scores of other agents. Under the name AGENT are those of an agent whose variants are compared with
-        the same variants of the run; under AGENT/VARIANT, one variant is compared with the run's last arm.
+      references: scores of other agents by entry of `against`; see `list_comparisons`.
     """
     for decoding in DECODINGS:
         # Within the run: the baseline was trained separately, and random choices have no networks of their own.
@@ -109,17 +107,33 @@ def difference_rows(
 
         for name, reference_scores in references.items():
             other_variants = variants_by_name(reference_scores, decoding)
-            _, is_single, single_variant = name.partition("/")
-            if is_single:
-                pairs = [(run.config.arms[-1], single_variant)]
-            else:
-                pairs = [(variant, variant) for variant in TRAINED_VARIANTS]
-            for variant, other_variant in pairs:
+            for variant, other_variant, reference_name in list_comparisons(run, name):
                 if variant in variants and other_variant in other_variants:
-                    reference_name = name if is_single else f"{name}/{variant}"
                     reference = other_variants[other_variant]
                     same_runs = other_variant in UNTRAINED_VARIANTS  # which have no networks of their own
                     yield from _compare(run, shift, variants[variant], reference, reference_name, same_runs=same_runs)
+
+
+class Comparison(NamedTuple):
+    """A variant of an agent and the variant of another agent with which it is compared, named AGENT/VARIANT."""
+
+    variant: str
+    other_variant: str
+    reference: str
+
+
+def list_comparisons(run: AgentRun, reference: str) -> list[Comparison]:
+    """List the comparisons of a run with one entry of `against`.
+
+    Args:
+      run: the run.
+      reference: AGENT, whose variants are compared with the same variants of the run, or AGENT/VARIANT, which is
+        compared with the run's last arm.
+    """
+    agent, is_single, other_variant = reference.partition("/")
+    if is_single:
+        return [Comparison(run.config.arms[-1], other_variant, reference)]
+    return [Comparison(variant, variant, f"{agent}/{variant}") for variant in TRAINED_VARIANTS]
 
 
 class VariantScores(NamedTuple):
@@ -151,19 +165,18 @@ def _compare(
     reference: VariantScores,
     reference_name: str,
     *,
-    same_runs: bool = False,
+    same_runs: bool,
 ) -> Iterator[ResultRow]:
     """Compare two variants in every metric, paired on the episodes."""
     check_same_episodes(compared.episodes, reference.episodes)
     clusters = compared.episodes.clusters()
-    for metric in METRICS:
+    for metric in METRIC_COLUMNS:
         difference = paired_difference(
             reference.metrics[metric], compared.metrics[metric], clusters, same_runs=same_runs
         )
         fields = row_fields(run, shift, compared.row)
-        yield ResultRow(
-            **fields, reference=reference_name, metric=metric, value=difference, scenes=num_scenes(compared.episodes)
-        )
+        fields |= {"reference": reference_name, "scenes": compared.episodes.num_drawn_scenes}
+        yield ResultRow(**fields, metric=metric, value=difference)
 
 
 def _compare_with_chance(run: AgentRun, shift: float, compared: VariantScores, random: VariantScores) -> ResultRow:
@@ -215,11 +228,6 @@ def check_same_episodes(episodes: EpisodeList, other: EpisodeList) -> None:
         raise InputError("the runs do not meet the same episodes; train both in one world, with equal rules")
 
 
-def num_scenes(episodes: EpisodeList) -> int:
-    """Number of scenes with episodes."""
-    return len(np.unique(episodes.scene))
-
-
 # Frontier search
 
 
@@ -236,7 +244,7 @@ def measure_frontier(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
         outcome = jax.tree.map(lambda *leaves: np.concatenate(leaves)[None], *outcomes)
         episodes = join_episode_lists(episode_lists)
         metrics = episode_metrics(outcome, episodes.best_length)
-        for metric in METRICS:
+        for metric in METRIC_COLUMNS:
             values = to_report_units(metric, metrics[metric])
             interval = mean_interval(values, episodes.clusters(), trained=False)
             yield ResultRow(
@@ -246,7 +254,7 @@ def measure_frontier(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
                 shift=shift,
                 metric=metric,
                 value=interval,
-                scenes=num_scenes(episodes),
+                scenes=episodes.num_drawn_scenes,
             )
 
 
@@ -268,7 +276,7 @@ def measure_account(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
         layout_blind_scores = bench.evaluate(layout_blind_run, shift)
         for lead in measure_leads(scores.results, layout_blind_scores.results):
             fields = row_fields(run, shift, scores.results.rows[lead.row_index])
-            fields |= {"reference": layout_blind_run.agent, "scenes": num_scenes(scores.episodes)}
+            fields |= {"reference": layout_blind_run.agent, "scenes": scores.episodes.num_drawn_scenes}
             yield ResultRow(**fields, metric=lead.metric, value=lead.lead)
             if lead.remaining is not None:
                 yield ResultRow(**fields, metric=f"{lead.metric} remaining", value=lead.remaining)

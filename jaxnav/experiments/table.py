@@ -127,7 +127,7 @@ class ResultTable:
         self._row_by_key: dict[tuple[Any, ...], ResultRow] = {}
         for row in self.rows:
             first_row = self._row_by_key.setdefault(_row_key(row), row)
-            if row is not first_row and row.to_json() != first_row.to_json():
+            if row is not first_row and _value_to_json(row.value) != _value_to_json(first_row.value):
                 raise InputError(f"two results have the same fields: {first_row.to_json()} and {row.to_json()}")
 
     def where(self, *selections: Mapping[str, Any], **fields: Any) -> "ResultTable":

@@ -428,11 +428,11 @@ class TrialOutcomes:
         Rows without sTDE do not depend on the gap and are made for the gap "" only. The layout variant is compared with
         the baseline, every other variant with the layout variant.
         """
-        num_scenes = len(self._episodes.scenes)
         for trial, outcome in self._outcomes.items():
             if (trial.variant == "stde") != bool(gap):
                 continue
-            trial_fields = {**fields, **trial.row_fields(), "gap": gap, "scenes": num_scenes}
+            trial_fields = {**fields, **trial.row_fields(), "gap": gap}
+            trial_fields["scenes"] = self._episodes.num_drawn_scenes
             yield ResultRow(**trial_fields, metric="weight", value=Interval(mean_removal_weight(outcome)))
             for metric in METRIC_COLUMNS:
                 interval = mean_interval(self._values(trial, metric), self._clusters)

@@ -205,6 +205,10 @@ def test_finished_runs_of_agents_keep_their_settings_and_references(drawn_run):
         ({"folds": {"all": ["nowhere"]}}, "folds.all: 'nowhere'"),
         ({"folds": {"near": ["near"]}}, "folds.near: a world"),
         ({"folds": {"all": ["near"], "both": ["near"]}}, "listed twice"),
+        (
+            {"worlds": {"near": {}, "far": {}}, "folds": {"all": ["near", "far"]}, "left_out": ("far-plain",)},
+            "left_out: plain .*far",
+        ),
         # Finished runs.
         ({"run": Path("nowhere")}, "nowhere"),
         ({"reference": "nowhere"}, "reference.*nowhere"),

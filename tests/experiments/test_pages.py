@@ -594,6 +594,39 @@ def test_claims_of_the_study_on_idle_experience_have_no_verdict(tmp_path):
     assert "experience is idle" not in text
 
 
+@pytest.mark.parametrize("template", ["methods", "factors"])
+@pytest.mark.parametrize(("reference", "row_reference"), [("org", "org/layout"), ("org/baseline", "org/baseline")])
+def test_agents_are_compared_with_an_agent_or_with_one_of_its_variants(tmp_path, template, reference, row_reference):
+    agents = {"org": {}, "hoz": {"method": "hoz", "arms": ["layout"], "against": [reference]}}
+    config = ExperimentConfig(agents=agents, shifts=(0.0,))
+    rows = [
+        *make_agent_rows("rooms", "org", baseline=50.0, layout=55.0),
+        *make_agent_rows("rooms", "hoz", layout=60.0),
+        make_effect("rooms", "hoz", "layout", row_reference, make_interval(10.0)),
+    ]
+    text = render(tmp_path, template, *rows, config=config)
+    lines = [line for line in text.splitlines() if line.startswith("| `hoz`") and "over `org`" in line]
+    assert any("+10.0 [+9.0, +11.0]" in line and "holds" in line for line in lines), text
+
+
+def test_cost_of_training_without_times_or_of_a_fit_has_no_nan(tmp_path):
+    agents = {"org": {}, "belief": {"method": "belief"}}
+    config = ExperimentConfig(agents=agents, shifts=(0.0,))
+    rows = make_agent_rows("rooms", "org", baseline=50.0)
+    rows.append(make_row(102400.0, world="rooms", run="belief", metric="searches (steps)"))
+    text = render(tmp_path, "methods", *rows, config=config)
+    cost = read_lines(text.split("Cost of training")[1])
+    assert cost["`belief`"][3] == "102,400"
+    assert cost["`org`"][4] == "-"
+    assert "nan" not in text
+
+
+def test_study_without_its_main_agent_has_a_page(tmp_path):
+    config = ExperimentConfig(agents={"main": {}, "streams": {"decision": "streams", "arms": ["layout"]}})
+    text = render(tmp_path, "study", *make_agent_rows("rooms", "streams", layout=50.0), config=config)
+    assert "### Claims" not in text
+
+
 def test_agents_of_factors_have_their_decision_share(tmp_path):
     agents = {
         "base": {"arms": ["baseline"]},
