@@ -30,7 +30,7 @@ from jaxnav.experiments.config import (
 )
 from jaxnav.experiments.gap_traces import measure_gaps
 from jaxnav.experiments.instrument import measure_instrument
-from jaxnav.experiments.mixture import list_removal_names, measure_cde, measure_handover, measure_mixture
+from jaxnav.experiments.mixture import RemainingDecision, list_removal_names, measure_removals
 from jaxnav.experiments.pages import check_page, render_page
 from jaxnav.experiments.scores import measure_account, measure_evaluation, measure_frontier, measure_groups
 from jaxnav.experiments.table import ResultRow, ResultTable, has_part, read_part, read_settings, write_part
@@ -81,10 +81,14 @@ class Measurement(NamedTuple):
     compares_removals: bool = False
 
 
-def _removal_measurement(measure: Callable[..., Iterator[ResultRow]]) -> Measurement:
-    """A measurement that compares removals."""
+def _removal_measurement(remaining: RemainingDecision) -> Measurement:
+    """A measurement that compares removals, each of which leaves the same decision."""
     return Measurement(
-        measure, parts="decodings", references=_layout_blind_agent, compares_shifts=True, compares_removals=True
+        partial(measure_removals, remaining=remaining),
+        parts="decodings",
+        references=_layout_blind_agent,
+        compares_shifts=True,
+        compares_removals=True,
     )
 
 
@@ -98,9 +102,9 @@ MEASUREMENTS = {
     "growth": Measurement(measure_growth, compares_shifts=True),
     "instrument": Measurement(measure_instrument, references=_layout_blind_agent, compares_shifts=True),
     "gaps": Measurement(measure_gaps, compares_shifts=True),
-    "mixture": _removal_measurement(measure_mixture),
-    "handover": _removal_measurement(measure_handover),
-    "cde": _removal_measurement(measure_cde),
+    "mixture": _removal_measurement("own"),
+    "handover": _removal_measurement("layout-blind"),
+    "cde": _removal_measurement("without experience"),
 }
 
 

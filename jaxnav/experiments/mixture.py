@@ -5,9 +5,9 @@ is worth its gain over the whole mixture. A gap is worth its gain over controls:
 mixture, the mean gap of all episodes at the same time, evidence of permuted categories, and removals that follow no
 gap.
 
-`measure_mixture` evaluates the removals of a run and their controls, `measure_handover` those that hand over to
-layout-blind agents, and `measure_cde` those that leave the network without experience. `PopulationMetrics` compares
-outcomes, at each shift and over the mixture.
+`measure_removals` evaluates the removals of a run and their controls, whichever decision remains: the own one of the
+run, that of layout-blind agents, or that of the network without experience. `PopulationMetrics` compares outcomes, at
+each shift and over the mixture.
 """
 
 import dataclasses
@@ -112,49 +112,12 @@ CONTROLS_BY_FORM: Mapping[Form, tuple[TrialControl | GapSchedule, ...]] = {
 PERMUTED_CONTROL = "permuted evidence"
 
 
-def measure_mixture(
-    bench: Bench, run: AgentRun, decoding: Decoding, rules: Sequence[RemovalRule] = REMOVAL_RULES
-) -> Iterator[ResultRow]:
-    """Evaluate removals and their controls, where removal leaves the run's own direct effect.
-
-    Args:
-      bench: trains the runs and compiles their worlds.
-      run: the run, with the layout arm.
-      decoding: rule that turns logits into actions.
-      rules: rules of soft removal, in addition to TDE and removals that follow no gap.
-
-    Raises:
-      InputError: there are no layout-blind agents, or they differ in world, goals or number of seeds. Runs whose scores
-        are a sum need none: they are compared with their own complete removal.
-    """
-    return _measure_removals(bench, run, decoding, rules, "own")
-
-
-def measure_handover(
-    bench: Bench, run: AgentRun, decoding: Decoding, rules: Sequence[RemovalRule] = REMOVAL_RULES
-) -> Iterator[ResultRow]:
-    """Evaluate removals that hand over to the layout-blind agents; see `measure_mixture`."""
-    return _measure_removals(bench, run, decoding, rules, "layout-blind")
-
-
-def measure_cde(
-    bench: Bench, run: AgentRun, decoding: Decoding, rules: Sequence[RemovalRule] = REMOVAL_RULES
-) -> Iterator[ResultRow]:
-    """Evaluate removals that leave the same network under do(Z = 0), the controlled direct effect.
-
-    See `measure_mixture`.
-
-    Raises:
-      InputError: the run has no experience dropout.
-    """
-    return _measure_removals(bench, run, decoding, rules, "without experience")
-
-
 class RemovalOutcomes(NamedTuple):
     """Outcomes of a run and its removals on the E episodes of a mixed population; outcomes have leaves [S, E].
 
     Attributes:
-      layout_blind: outcome of the layout-blind agents.
+      reference: outcome of the agents without experience: layout-blind ones or, where scores are a sum, the run itself
+        after complete removal.
       plain: outcome of the run without removal.
       hard: outcome of complete removal.
       fixed: outcomes of the removals that follow no gap, by name.
@@ -163,7 +126,7 @@ class RemovalOutcomes(NamedTuple):
       rule_controls: outcomes of the controls of each rule, by rule and control.
     """
 
-    layout_blind: EpisodeOutcome
+    reference: EpisodeOutcome
     plain: EpisodeOutcome
     hard: EpisodeOutcome
     fixed: dict[str, EpisodeOutcome]
@@ -172,14 +135,25 @@ class RemovalOutcomes(NamedTuple):
     rule_controls: dict[str, dict[str, EpisodeOutcome]]
 
 
-def _measure_removals(
-    bench: Bench, run: AgentRun, decoding: Decoding, rules: Sequence[RemovalRule], remaining: RemainingDecision
+def measure_removals(
+    bench: Bench,
+    run: AgentRun,
+    decoding: Decoding,
+    remaining: RemainingDecision,
+    rules: Sequence[RemovalRule] = REMOVAL_RULES,
 ) -> Iterator[ResultRow]:
-    """Evaluate removals and their controls; see `measure_mixture`.
+    """Evaluate removals of experience and their controls on a mixed population.
 
     Args:
-      bench, run, decoding, rules: see `measure_mixture`.
+      bench: trains the runs and compiles their worlds.
+      run: the run, with the layout arm.
+      decoding: rule that turns logits into actions.
       remaining: decision that remains once experience is removed.
+      rules: rules of soft removal, in addition to TDE and removals that follow no gap.
+
+    Raises:
+      InputError: there are no layout-blind agents, or they differ in world, goals or number of seeds; runs whose scores
+        are a sum need none. Or a run without experience dropout shall leave the decision without experience.
     """
     budgets = WORLDS[run.config.world].budgets
     shifts = (bench.config.shifts[0], bench.config.shifts[-1])
@@ -206,7 +180,7 @@ def _measure_removals(
         fields={"world": run.world, "run": run_names[remaining], "decoding": decoding},
         shifts=shifts,
         metrics=metrics,
-        layout_blind=metrics.percent_metrics(outcomes.layout_blind),
+        reference=metrics.percent_metrics(outcomes.reference),
         agent=metrics.percent_metrics(outcomes.plain),
         same_runs=remaining == "own" and run.config.policy_method.has_additive_scores,
         num_scenes=len(episodes.scenes) // len(shifts),
@@ -311,17 +285,17 @@ def _run_removals(
     plain_trial = Trial("layout", decoding)
     hard_trial = Trial("tde", decoding)
     outcomes = trials.run("plain", evaluated_run, estimator, [plain_trial, hard_trial, *fixed_trials.values()])
-    layout_blind_outcome = outcomes[hard_trial]
+    reference_outcome = outcomes[hard_trial]
     if layout_blind is not None:
         baseline_trial = Trial("baseline", decoding)
-        layout_blind_outcome = trials.run("layout-blind", layout_blind, None, [baseline_trial])[baseline_trial]
+        reference_outcome = trials.run("layout-blind", layout_blind, None, [baseline_trial])[baseline_trial]
 
     hard_controls = {}
     if remaining == "own":
         hard_controls = _run_hard_controls(bench, trials, evaluated_run, estimator, decoding)
     rule_outcomes, rule_controls = _run_rules(bench, trials, evaluated_run, estimator, decoding, rules)
     return RemovalOutcomes(
-        layout_blind=layout_blind_outcome,
+        reference=reference_outcome,
         plain=outcomes[plain_trial],
         hard=outcomes[hard_trial],
         fixed={name: outcomes[trial] for name, trial in fixed_trials.items()},
@@ -554,11 +528,11 @@ class PopulationMetrics:
         return self._for_each_shift(difference, reference, compared)
 
     def remaining_shares(
-        self, layout_blind: MetricValues, agent: MetricValues, removed: MetricValues, *, same_runs: bool
+        self, reference: MetricValues, agent: MetricValues, removed: MetricValues, *, same_runs: bool
     ) -> dict[str, tuple[Interval, ...]]:
         """Compute the share of the lead that remains after removal, for each metric at each shift."""
         statistic = functools.partial(remaining_share, same_runs=same_runs)
-        return self._for_each_shift(statistic, layout_blind, agent, removed)
+        return self._for_each_shift(statistic, reference, agent, removed)
 
     def overall_differences(self, reference: MetricValues, compared: MetricValues) -> dict[str, Interval]:
         """Compute `compared - reference` of the same policies over all episodes, for each metric."""
@@ -589,7 +563,7 @@ class _RemovalReport(NamedTuple):
       fields: fields of all rows.
       shifts: layout shifts of the population.
       metrics: computes and compares metrics.
-      layout_blind: results of the layout-blind agent.
+      reference: results of the agents without experience.
       agent: results of the agent with experience, without removal.
       same_runs: True if both agents are the same training runs.
       num_scenes: number of scenes at each shift.
@@ -598,7 +572,7 @@ class _RemovalReport(NamedTuple):
     fields: Mapping[str, Any]
     shifts: tuple[float, ...]
     metrics: PopulationMetrics
-    layout_blind: MetricValues
+    reference: MetricValues
     agent: MetricValues
     same_runs: bool
     num_scenes: int
@@ -609,8 +583,8 @@ class _RemovalReport(NamedTuple):
 
     def agent_rows(self) -> Iterator[ResultRow]:
         """Make the rows of both agents without removal, and of the lead of one over the other."""
-        lead = self.metrics.differences(self.layout_blind, self.agent, same_runs=self.same_runs)
-        yield from self._shift_rows(self.metrics.means(self.layout_blind), variant=LAYOUT_BLIND)
+        lead = self.metrics.differences(self.reference, self.agent, same_runs=self.same_runs)
+        yield from self._shift_rows(self.metrics.means(self.reference), variant=LAYOUT_BLIND)
         yield from self._shift_rows(self.metrics.means(self.agent), variant=WITHOUT_REMOVAL)
         yield from self._shift_rows(lead, variant=WITHOUT_REMOVAL, reference=LAYOUT_BLIND)
 
@@ -634,7 +608,7 @@ class _RemovalReport(NamedTuple):
             yield self.row(metric, difference, **fields)
 
         # The share of the lead that remains, of a value or a cost.
-        shares = metrics.remaining_shares(self.layout_blind, self.agent, removed, same_runs=self.same_runs)
+        shares = metrics.remaining_shares(self.reference, self.agent, removed, same_runs=self.same_runs)
         share_rows = {f"{metric} remaining": by_shift for metric, by_shift in shares.items()}
         yield from self._shift_rows(share_rows, variant=name)
 

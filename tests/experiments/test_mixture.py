@@ -23,9 +23,7 @@ from jaxnav.experiments.mixture import (
     join_end_to_end,
     list_fixed_trials,
     list_removal_names,
-    measure_cde,
-    measure_handover,
-    measure_mixture,
+    measure_removals,
     select_removals,
 )
 from jaxnav.experiments.table import ResultTable
@@ -181,7 +179,7 @@ def test_mixture_measures_every_removal_at_both_shifts(bench):
     surprise_rules = [rule for rule in REMOVAL_RULES if rule.gap == "surprise"]
     assert surprise_rules
     tried_rules = (*surprise_rules, *rules)
-    table = ResultTable(measure_mixture(bench, bench.find_run("rooms", "main"), "sample", tried_rules))
+    table = ResultTable(measure_removals(bench, bench.find_run("rooms", "main"), "sample", "own", tried_rules))
     row_fields = {"world": "rooms", "run": "main", "decoding": "sample"}
     assert {(row.world, row.run, row.decoding) for row in table.rows} == {("rooms", "main", "sample")}
     assert {row.scenes for row in table.rows} == {4}
@@ -228,7 +226,7 @@ def test_mixture_measures_every_removal_at_both_shifts(bench):
 
 @pytest.mark.exhaustive
 def test_handover_leaves_the_layout_blind_agents(bench):
-    table = ResultTable(measure_handover(bench, bench.find_run("rooms", "main"), "argmax", ()))
+    table = ResultTable(measure_removals(bench, bench.find_run("rooms", "main"), "argmax", "layout-blind", ()))
     (name,) = table.distinct("run")
     row_fields = {"world": "rooms", "run": name, "decoding": "argmax"}
     # An agent that hands over at once is worth as much as the layout-blind agents.
@@ -249,12 +247,14 @@ def test_folds_of_a_dataset_count_as_one_world(make_bench, drawn_run):
     fold_tables = []
     for fold in folds:
         fold_bench = make_bench(**settings, episodes=8)
-        fold_tables.append(ResultTable(measure_handover(fold_bench, fold_bench.find_run(fold, "main"), "argmax", ())))
+        fold_tables.append(
+            ResultTable(measure_removals(fold_bench, fold_bench.find_run(fold, "main"), "argmax", "layout-blind", ()))
+        )
 
     dataset_bench = make_bench(**settings, episodes=16, folds={"both": list(folds)})
     (dataset_run,) = join_folds(dataset_bench.config, [dataset_bench.find_run("first", "main")])
     assert [fold.world for fold in dataset_run.folds] == list(folds)
-    table = ResultTable(measure_handover(dataset_bench, dataset_run, "argmax", ()))
+    table = ResultTable(measure_removals(dataset_bench, dataset_run, "argmax", "layout-blind", ()))
     assert table.num_scenes(variant=WITHOUT_REMOVAL) == 2 * fold_tables[0].num_scenes(variant=WITHOUT_REMOVAL)
     num_compared = 0
     for row in table.rows:
@@ -288,7 +288,10 @@ def test_interrupted_mixtures_keep_finished_outcomes(make_bench, drawn_run, tmp_
     def measure(folder):
         bench = make_bench(**settings)
         bench.unfinished_folder = folder
-        return [row.to_json() for row in measure_handover(bench, bench.find_run("rooms", "main"), "argmax", ())]
+        return [
+            row.to_json()
+            for row in measure_removals(bench, bench.find_run("rooms", "main"), "argmax", "layout-blind", ())
+        ]
 
     expected_rows = measure(None)
     monkeypatch.setattr(TrialRunner, "run_trials", count_calls)
@@ -319,7 +322,7 @@ def test_cde_leaves_the_network_without_experience(make_bench, drawn_run, tmp_pa
     )
     run = {"run": str(draw_run(dropping_config).config.run_dir)}
     bench = make_bench(agents={"main": run, "anonymous": run}, shifts=(0.0, 1.0), episodes=8)
-    table = ResultTable(measure_cde(bench, bench.find_run("rooms", "main"), "argmax", ()))
+    table = ResultTable(measure_removals(bench, bench.find_run("rooms", "main"), "argmax", "without experience", ()))
     row_fields = {"world": "rooms", "run": "main, without experience", "decoding": "argmax"}
     removals = table.distinct("variant", row_fields, reference=WITHOUT_REMOVAL)
     assert removals[:2] == ["CDE", ORACLE_NAME]
@@ -336,15 +339,15 @@ def test_cde_leaves_the_network_without_experience(make_bench, drawn_run, tmp_pa
         assert change.mean == pytest.approx(100 * (removed - plain), abs=1e-6)
 
     # A mixture of the own counterfactual memory shows the factual one beside it.
-    table = ResultTable(measure_mixture(bench, bench.find_run("rooms", "main"), "argmax", ()))
+    table = ResultTable(measure_removals(bench, bench.find_run("rooms", "main"), "argmax", "own", ()))
     assert "TDE, factual memory" in table.distinct("variant", reference=WITHOUT_REMOVAL)
 
 
-@pytest.mark.parametrize("measure", [measure_mixture, measure_handover, measure_cde])
+@pytest.mark.parametrize("remaining", ["own", "layout-blind", "without experience"])
 @pytest.mark.parametrize("changes", [{"seeds": 3}, {"world": "houses"}, {"worlds": {"num_val": 5}}])
-def test_mixtures_refuse_runs_that_differ_before_any_training(make_bench, drawn_run, measure, changes):
+def test_mixtures_refuse_runs_that_differ_before_any_training(make_bench, drawn_run, remaining, changes):
     bench = make_bench(agents={"main": {}, "anonymous": changes}, base=drawn_run.config, shifts=(0.0, 1.0))
     run = bench.find_run("rooms", "main")
     with pytest.raises(InputError, match=f"differ in {next(iter(changes))}"):
-        next(measure(bench, run, "sample"))
+        next(measure_removals(bench, run, "sample", remaining))
     assert not run.config.run_dir.exists()
