@@ -15,11 +15,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from jaxnav.choices import Form
+from jaxnav.evaluation.report import METRIC_COLUMNS
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.experiments.gap_traces import Belief
 from jaxnav.experiments.similarity import GainBySimilarity, SuccessBySimilarity, gain_of_table, success_of_table
 from jaxnav.experiments.table import Curve, ResultTable
-from jaxnav.experiments.trials import PAPER_THRESHOLD, SWEPT_FORMS, ZERO_THRESHOLD, Trial
+from jaxnav.experiments.trials import RESIDUAL_HALF, STDE_NAMES, SWEPT_FORMS, Trial
 from jaxnav.viz.style import (
     MUTED_COLOR,
     TEXT_COLOR,
@@ -48,11 +49,8 @@ BAR_COLOR = "#a9a9a9"
 POINT_COLOR = "#0072B2"
 MAX_MARKER_AREA = 60.0  # points^2, of the marker with the most episodes
 NUM_BINS = 6  # in the similarity figure, of equal numbers of points
-_METRIC_LABELS: Mapping[str, str] = {"sr": "SR (%)", "spl": "SPL (%)", "dts": "DTS (m)"}
 _BELIEF_STYLES: Mapping[Belief, dict[str, Any]] = {"updated": {"ls": "-"}, "frozen": {"ls": "--", "mfc": "white"}}
 
-#: sTDE at the paper's threshold, and without one in the paper's form, as named in figures.
-STDE_NAMES = {"sTDE (eps 0.5)": PAPER_THRESHOLD, "sTDE (eps 0, paper's form)": ZERO_THRESHOLD}
 #: Mean gaps of one estimator, by shift and belief.
 GapLines = Mapping[tuple[float, Belief], Curve]
 
@@ -65,7 +63,7 @@ def _similarity_of_table(table: ResultTable, shifts: Sequence[float], fields: Ma
 
 
 def _gain_of_table(table: ResultTable, shifts: Sequence[float], fields: Mapping[str, Any]) -> Figure:
-    trial_fields = {**fields, **Trial("stde", "argmax", *PAPER_THRESHOLD).row_fields()}
+    trial_fields = {**fields, **Trial("stde", "argmax", *RESIDUAL_HALF).row_fields()}
     gains = {shift: gain_of_table(table, **trial_fields, shift=shift) for shift in (shifts[0], shifts[-1])}
     return gain_figure(gains, "+ w + sTDE")
 
@@ -78,7 +76,7 @@ def _epsilon_of_table(table: ResultTable, shifts: Sequence[float], fields: Mappi
         thresholds = sorted(table.distinct("epsilon", **stde, metric="sr", reference="", control=""))
         metrics_by_epsilon = {}
         for epsilon in thresholds:
-            metrics = {metric: table.find(**stde, epsilon=epsilon, metric=metric) for metric in _METRIC_LABELS}
+            metrics = {metric: table.find(**stde, epsilon=epsilon, metric=metric) for metric in METRIC_COLUMNS}
             metrics_by_epsilon[epsilon] = metrics
         sweeps[shift, form] = metrics_by_epsilon
     return epsilon_figure(sweeps)
@@ -214,19 +212,19 @@ def epsilon_figure(sweeps: Mapping[tuple[float, Form], Mapping[float, Mapping[st
     """
     forms = list(dict.fromkeys(form for _, form in sweeps))
     shifts = sorted({shift for shift, _ in sweeps})
-    figure, panels = make_panels(len(forms), len(_METRIC_LABELS), height=2.3 * len(forms) + 0.4, sharey="col")
+    figure, panels = make_panels(len(forms), len(METRIC_COLUMNS), height=2.3 * len(forms) + 0.4, sharey="col")
 
     style_by_shift = dict(zip(shifts, repeat_styles(LINE_STYLES, len(shifts)), strict=True))
     for (shift, form), metrics_by_epsilon in sweeps.items():
         style = style_by_shift[shift]
         epsilons = list(metrics_by_epsilon)
-        for axes, metric in zip(panels[forms.index(form)], _METRIC_LABELS, strict=True):
+        for axes, metric in zip(panels[forms.index(form)], METRIC_COLUMNS, strict=True):
             intervals = [metrics[metric] for metrics in metrics_by_epsilon.values()]
             axes.plot(epsilons, [interval.seeds for interval in intervals], color=style["color"], **SEED_STYLE)
             draw_band(axes, Curve.from_intervals(epsilons, intervals), style)
 
     for form, row_axes in zip(forms, panels, strict=True):
-        for axes, label in zip(row_axes, _METRIC_LABELS.values(), strict=True):
+        for axes, (label, _) in zip(row_axes, METRIC_COLUMNS.values(), strict=True):
             axes.set(ylabel=label, xlabel="Threshold ε")
         set_panel_title(row_axes[0], f"{form.capitalize()} form")
 

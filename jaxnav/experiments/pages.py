@@ -25,6 +25,7 @@ from jaxnav.experiments.bench import best_epsilon
 from jaxnav.experiments.config import AgentRun, ExperimentConfig, agent_runs, join_folds
 from jaxnav.experiments.scores import chooses_actions, list_comparisons
 from jaxnav.experiments.table import ResultTable, merge_fields
+from jaxnav.experiments.trials import STDE_NAMES
 from jaxnav.scenes.worlds import WORLDS
 from jaxnav.store.files import write_atomic
 from jaxnav.viz import require_plotting_packages
@@ -138,6 +139,7 @@ def _load_template(template: str) -> jinja2.Template:
         "best_epsilon": best_epsilon,
         "chooses_actions": chooses_actions,
         "list_comparisons": list_comparisons,
+        "stde_fields": {name: {"variant": "stde", **options._asdict()} for name, options in STDE_NAMES.items()},
         "requested_steps": requested_steps,
         "total_steps": total_steps,
         "differ_only_in_layout": differ_only_in_layout,

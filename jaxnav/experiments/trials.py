@@ -64,10 +64,13 @@ class StdeOptions(NamedTuple):
 
 
 SWEPT_FORMS: tuple[Form, ...] = ("residual", "paper")
-#: The paper's threshold, and no threshold in the paper's form; both are evaluated with all gaps and controls.
-PAPER_THRESHOLD = StdeOptions(0.5, "residual")
-ZERO_THRESHOLD = StdeOptions(0.0, "paper")
-STDE_OPTIONS = (PAPER_THRESHOLD, ZERO_THRESHOLD)
+#: The paper's threshold in the form `residual`, and no threshold in the paper's form; both are evaluated with all gaps
+#: and controls.
+RESIDUAL_HALF = StdeOptions(0.5, "residual")
+PAPER_ZERO = StdeOptions(0.0, "paper")
+#: Both, by their names on pages and in figures.
+STDE_NAMES = {"sTDE (eps 0.5)": RESIDUAL_HALF, "sTDE (eps 0, paper's form)": PAPER_ZERO}
+STDE_OPTIONS = tuple(STDE_NAMES.values())
 #: Controls of sTDE, with argmax; zeros are sampled, because subtracting them cannot change the best action. The control
 #: `constant` depends on the mean weight of the others and runs after them.
 STDE_CONTROLS: tuple[tuple[TrialControl, Decoding], ...] = (
@@ -311,7 +314,7 @@ def measure_growth(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
 
     Both shifts share scenes and training runs, so the jackknife leaves out a scene or a run of both at once.
     """
-    trials = (Trial("layout"), Trial("stde", "argmax", *PAPER_THRESHOLD))
+    trials = (Trial("layout"), Trial("stde", "argmax", *RESIDUAL_HALF))
     runner = TrialRunner(bench.config.seed)
     shifts = (bench.config.shifts[0], bench.config.shifts[-1])
     conditions = []
@@ -493,6 +496,6 @@ def _similarity_rows(
     points = compute_similarity_points(episodes, cooccurrence_counts(bank), prior)
     baseline_success = outcomes.success(Trial("baseline"))
     yield from success_rows(fields, points, baseline_success)
-    trial = Trial("stde", "argmax", *PAPER_THRESHOLD)
+    trial = Trial("stde", "argmax", *RESIDUAL_HALF)
     trial_fields = {**fields, **trial.row_fields()}
     yield from gain_rows(trial_fields, points, baseline_success, outcomes.success(trial), world.env.categories)
