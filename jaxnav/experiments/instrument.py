@@ -2,7 +2,7 @@
 
 A valid shift leaves the difficulty of the scenes unchanged, costs agents that rely on the training layout, and costs
 nothing to layout-blind agents. `measure_scenes` measures a world at one shift, scene by scene;
-`compare_shifts` turns the measures of several shifts into rows of results.
+`compare_shifts` turns the measures of several shifts into rows of results, and `judge_shift` judges these by criteria.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,7 +22,7 @@ from jaxnav.evaluation.variants import table_row
 from jaxnav.experiments.bench import Bench
 from jaxnav.experiments.config import AgentRun
 from jaxnav.experiments.scores import require_layout_blind_run
-from jaxnav.experiments.table import ResultRow
+from jaxnav.experiments.table import ResultRow, ResultTable
 from jaxnav.runs.evaluate import evaluate_rows
 from jaxnav.runs.policies import Policies, load_policies
 from jaxnav.runs.worlds import CompiledWorld
@@ -44,6 +44,12 @@ LAYOUT_BLIND_MEASURES = (
     "layout_blind_argmax_wrong",
     "layout_blind_sample_wrong",
 )
+#: Largest change of difficulty, in %, and largest mean change over categories, in points.
+MAX_CHANGE = 5.0
+#: Least loss of agents that rely on the layout, in points.
+MIN_LOSS = 8.0
+#: Loss of layout-blind agents, in points, that is too large.
+LAYOUT_BLIND_LOSS = 2.0
 
 
 def measure_instrument(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
@@ -380,3 +386,55 @@ def _category_means(total: SceneTotals, measure: str, design: SharedDesign) -> n
             design.jackknife_means(np.nan_to_num(scene_values)[None], scene_weights, total.names, trained=False)
         )
     return np.stack(category_means)
+
+
+# Judgement
+
+
+class Criterion(NamedTuple):
+    """A criterion of a valid layout shift, judged by one measure.
+
+    Attributes:
+      name: name of the criterion.
+      measure: name of the measure.
+      changes: changes at the further shifts, in percent of the first shift for measures of difficulty, else in points;
+        a loss is that at the last shift alone.
+      is_met: True if the means of all changes are within the limit, and a loss that is wanted is clear of 0.
+    """
+
+    name: str
+    measure: str
+    changes: tuple[Interval, ...]
+    is_met: bool
+
+
+def judge_shift(table: ResultTable, fields: Mapping[str, Any], shifts: Sequence[float]) -> list[Criterion]:
+    """Judge whether a layout shift keeps the difficulty, costs agents that rely on the layout, and costs no others.
+
+    Args:
+      table: rows of `measure_instrument`.
+      fields: world and run of these rows.
+      shifts: layout shifts; the first is the training layout.
+    """
+
+    def change_of(measure: str, shift: float) -> Interval:
+        return table.find(fields, shift=shift, reference="first shift", metric=measure)
+
+    criteria = []
+    for measure in DIFFICULTY_MEASURES:
+        changes = tuple(change_of(measure, shift) for shift in shifts[1:])
+        is_met = all(abs(change.mean) <= MAX_CHANGE for change in changes)
+        criteria.append(Criterion("Difficulty matched", measure, changes, is_met))
+    for measure in CATEGORY_MEASURES:
+        changes = tuple(change_of(f"{measure} by category", shift) for shift in shifts[1:])
+        is_met = all(change.mean <= MAX_CHANGE for change in changes)
+        criteria.append(Criterion("Categories matched", measure, changes, is_met))
+    for measure in BASELINE_MEASURES:
+        loss = change_of(measure, shifts[-1])
+        is_met = loss.mean >= MIN_LOSS and loss.low > 0.0
+        criteria.append(Criterion("Discriminating", measure, (loss,), is_met))
+    if table.has(fields, shift=shifts[0], metric=LAYOUT_BLIND_MEASURES[0]):
+        for measure in LAYOUT_BLIND_MEASURES:
+            loss = change_of(measure, shifts[-1])
+            criteria.append(Criterion("No loss if layout-blind", measure, (loss,), loss.mean < LAYOUT_BLIND_LOSS))
+    return criteria

@@ -23,6 +23,7 @@ from jaxnav.evaluation.notes import MIN_OTHER_CATEGORIES_SHARE
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.experiments.bench import best_epsilon
 from jaxnav.experiments.config import AgentRun, ExperimentConfig, agent_runs, join_folds
+from jaxnav.experiments.instrument import judge_shift
 from jaxnav.experiments.scores import chooses_actions, list_comparisons
 from jaxnav.experiments.table import ResultTable, merge_fields
 from jaxnav.experiments.trials import STDE_NAMES
@@ -139,6 +140,7 @@ def _load_template(template: str) -> jinja2.Template:
         "best_epsilon": best_epsilon,
         "chooses_actions": chooses_actions,
         "list_comparisons": list_comparisons,
+        "judge_shift": judge_shift,
         "stde_fields": {name: {"variant": "stde", **options._asdict()} for name, options in STDE_NAMES.items()},
         "requested_steps": requested_steps,
         "total_steps": total_steps,
