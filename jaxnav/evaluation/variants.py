@@ -23,6 +23,11 @@ from jaxnav.evaluation.replacements import ReplacedPart
 REMOVAL_VARIANTS: Mapping[Removal, tuple[Variant, Variant]] = {"tde": ("tde", "stde"), "cde": ("cde", "scde")}
 
 
+def share_networks(variant: str, reference: str) -> bool:
+    """True if two variants of one run act by the same networks; only the baseline was trained on its own."""
+    return "baseline" not in (variant, reference)
+
+
 class EvaluationRow(NamedTuple):
     """One row of an evaluation table.
 

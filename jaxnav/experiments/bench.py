@@ -1,6 +1,6 @@
-"""The workbench of an experiment: trained runs, compiled worlds and evaluations, each made once.
+"""The workbench of an experiment: trained runs and evaluations, each made once, and compiled worlds.
 
-Measurements ask a `Bench` for what they need, and the bench trains, compiles or evaluates what is missing.
+Measurements ask a `Bench` for what they need, and the bench trains or evaluates what is missing.
 """
 
 import hashlib

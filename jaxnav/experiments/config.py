@@ -141,7 +141,12 @@ class AgentRun(NamedTuple):
     @property
     def name(self) -> str:
         """Name of the run in its folder."""
-        return f"{self.world}-{self.agent}".replace(":", "-")
+        return self.selector.replace(":", "-")
+
+    @property
+    def selector(self) -> str:
+        """WORLD-AGENT, which the patterns of `only`, `left_out` and `measure` select."""
+        return f"{self.world}-{self.agent}"
 
     @property
     def fold_runs(self) -> tuple["AgentRun", ...]:
@@ -200,7 +205,7 @@ def check_experiment(config: ExperimentConfig) -> ExperimentConfig:
 
     # Listing the runs checks the settings of each.
     runs = agent_runs(config)
-    if not any(matches_any(f"{run.world}-{run.agent}", config.only) for run in runs):
+    if not any(matches_any(run.selector, config.only) for run in runs):
         raise InputError("worlds, agents, only and left_out: select no run; give others")
     for measurement, patterns in config.measure.items():
         if not patterns:
@@ -380,14 +385,14 @@ def measured_runs(config: ExperimentConfig, measurement: str) -> list[AgentRun]:
     patterns = tuple(config.measure[measurement])
     runs = []
     for run in agent_runs(config):
-        if _is_measured(run, patterns) and matches_any(f"{run.world}-{run.agent}", config.only):
+        if _is_measured(run, patterns) and matches_any(run.selector, config.only):
             runs.append(run)
     return runs
 
 
 def _is_measured(run: AgentRun, patterns: tuple[str, ...]) -> bool:
     """True if the agent of a run, or its world and agent, match one of the patterns of a measurement."""
-    return matches_any(run.agent, patterns) or matches_any(f"{run.world}-{run.agent}", patterns)
+    return matches_any(run.agent, patterns) or matches_any(run.selector, patterns)
 
 
 def join_folds(config: ExperimentConfig, runs: list[AgentRun]) -> list[AgentRun]:

@@ -19,7 +19,7 @@ from jaxnav.evaluation.grid import episode_metrics
 from jaxnav.evaluation.notes import last_quarter_success
 from jaxnav.evaluation.report import METRIC_COLUMNS, UNTRAINED_VARIANTS, to_report_units
 from jaxnav.evaluation.statistics import Interval, mean_interval, paired_difference
-from jaxnav.evaluation.variants import EvaluationRow
+from jaxnav.evaluation.variants import EvaluationRow, share_networks
 from jaxnav.experiments.bench import Bench, Scores
 from jaxnav.experiments.config import AgentRun
 from jaxnav.experiments.table import ResultRow
@@ -93,11 +93,11 @@ def difference_rows(
       references: scores of other agents by entry of `against`; see `list_comparisons`.
     """
     for decoding in DECODINGS:
-        # Within the run: the baseline was trained separately, and random choices have no networks of their own.
+        # Within the run; random choices have no networks of their own.
         variants = variants_by_name(scores, decoding)
         for variant, reference in VARIANT_COMPARISONS:
             if variant in variants and reference in variants:
-                same_runs = "baseline" not in (variant, reference)
+                same_runs = share_networks(variant, reference)
                 yield from _compare(run, shift, variants[variant], variants[reference], reference, same_runs=same_runs)
         for variant in TRAINED_VARIANTS:
             if variant in variants:
@@ -345,8 +345,7 @@ def measure_groups(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
             check_same_episodes(compared[0].episodes, other.episodes)
         clusters = compared[0].episodes.clusters()
         is_untrained = agent_variant in UNTRAINED_VARIANTS
-        same_networks = not agent and "baseline" not in (variant, reference)
-        same_runs = is_untrained or same_networks
+        same_runs = is_untrained or (not agent and share_networks(variant, reference))
         num_compared = min(len(scores.metrics["sr"]) for scores in compared)
         num_references = min(len(scores.metrics["sr"]) for scores in references)
         if same_runs:

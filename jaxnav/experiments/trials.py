@@ -23,7 +23,7 @@ from jaxnav.evaluation.replacements import ReplacedPart
 from jaxnav.evaluation.report import METRIC_COLUMNS, to_report_units
 from jaxnav.evaluation.similarity import cooccurrence_counts
 from jaxnav.evaluation.statistics import Interval, SharedDesign, mean_interval, paired_difference
-from jaxnav.evaluation.variants import inference_grid, table_row
+from jaxnav.evaluation.variants import inference_grid, share_networks, table_row
 from jaxnav.experiments.bench import Bench
 from jaxnav.experiments.config import AgentRun
 from jaxnav.experiments.similarity import compute_similarity_points, gain_rows, success_rows
@@ -347,7 +347,8 @@ def measure_growth(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
 def prepare_run(bench: Bench, run: AgentRun, shift: float) -> EvaluatedRun:
     """Load the policies of a run and draw its episodes at a shift.
 
-    If a run has only the layout arm, its policies also serve as those of the baseline arm.
+    The policies of a run with the layout arm alone stand at the places of both arms, so that those of the layout arm
+    have the same index, and with it the same random numbers, as in an evaluation.
 
     Raises:
       InputError: the scenes fill more than one shard.
@@ -441,7 +442,7 @@ class TrialOutcomes:
                 interval = mean_interval(self._values(trial, metric), self._clusters)
                 yield ResultRow(**trial_fields, metric=metric, value=interval)
 
-            # Both sides use the same decoding rule. The baseline was trained separately; all others share networks.
+            # Both sides use the same decoding rule.
             reference = Trial("baseline" if trial.variant == "layout" else "layout", trial.decoding)
             if trial.variant == "baseline" or reference not in self._outcomes:
                 continue
@@ -449,7 +450,7 @@ class TrialOutcomes:
                 self._values(reference, "sr"),
                 self._values(trial, "sr"),
                 self._clusters,
-                same_runs=trial.variant != "layout",
+                same_runs=share_networks(trial.variant, reference.variant),
             )
             yield ResultRow(**trial_fields, reference=reference.variant, metric="sr", value=difference)
 

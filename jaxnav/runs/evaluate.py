@@ -38,6 +38,7 @@ from jaxnav.evaluation.variants import (
     Replacement,
     inference_grid,
     replacement_grid,
+    share_networks,
     table_row,
     table_rows,
 )
@@ -486,7 +487,7 @@ def _build_differences(results: Results, *, trained: bool) -> list[dict[str, Any
                 form=row.form,
                 decoding=row.decoding,
                 episodes=results.episodes,
-                same_runs=reference_variant == "layout",
+                same_runs=share_networks(row.variant, reference_variant),
                 trained=trained,
             )
             difference_rows.append(difference_row)
