@@ -316,25 +316,16 @@ def measure_groups(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
     """
     shift = bench.config.shifts[0]
     for name, group in bench.config.groups.items():
-        members = []
-        for agent in group["agents"]:
-            member_run = bench.find_run(run.world, agent)
-            if member_run is not None:
-                members.append(variants_by_name(bench.evaluate(member_run, shift), "argmax"))
         variant, reference = group["variant"], group["against"]
-        members = [member for member in members if variant in member]
+        members = [member for member in _evaluate_agents(bench, run.world, group["agents"], shift) if variant in member]
 
-        # The reference is a variant of the same agents, or AGENT/VARIANT.
-        agent, _, agent_variant = reference.rpartition("/")
-        if agent:
-            reference_run = bench.find_run(run.world, agent)
-            if reference_run is None:
-                continue
-            reference_variants = variants_by_name(bench.evaluate(reference_run, shift), "argmax")
-            references = [reference_variants[agent_variant]] if agent_variant in reference_variants else []
+        # The reference is AGENT/VARIANT, or a variant of the same agents.
+        reference_agent, _, reference_variant = reference.rpartition("/")
+        if reference_agent:
+            reference_agents = _evaluate_agents(bench, run.world, [reference_agent], shift)
         else:
-            members = [member for member in members if reference in member]
-            references = [member[reference] for member in members]
+            reference_agents = members = [member for member in members if reference_variant in member]
+        references = [other[reference_variant] for other in reference_agents if reference_variant in other]
         if not members or not references:
             continue
 
@@ -344,8 +335,8 @@ def measure_groups(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
         for other in (*compared[1:], *references):
             check_same_episodes(compared[0].episodes, other.episodes)
         clusters = compared[0].episodes.clusters()
-        is_untrained = agent_variant in UNTRAINED_VARIANTS
-        same_runs = is_untrained or (not agent and share_networks(variant, reference))
+        is_untrained = reference_variant in UNTRAINED_VARIANTS
+        same_runs = is_untrained or (not reference_agent and share_networks(variant, reference_variant))
         num_compared = min(len(scores.metrics["sr"]) for scores in compared)
         num_references = min(len(scores.metrics["sr"]) for scores in references)
         if same_runs:
@@ -356,6 +347,16 @@ def measure_groups(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
         fields = {"world": run.world, "run": name, "variant": variant, "decoding": "argmax", "shift": shift}
         yield ResultRow(**fields, reference=reference, metric="sr", value=effect)
         yield ResultRow(**fields, reference=reference, metric="agents", value=Interval(float(len(members))))
+
+
+def _evaluate_agents(bench: Bench, world: str, agents: Sequence[str], shift: float) -> list[dict[str, VariantScores]]:
+    """Scores of every variant with best actions, for each of the agents that has a run in a world."""
+    evaluated = []
+    for agent in agents:
+        agent_run = bench.find_run(world, agent)
+        if agent_run is not None:
+            evaluated.append(variants_by_name(bench.evaluate(agent_run, shift), "argmax"))
+    return evaluated
 
 
 def _mean_sr(scores: Sequence[VariantScores], num_runs: int) -> np.ndarray:
