@@ -31,6 +31,7 @@ from jaxnav.scenes.worlds import WORLDS
 from jaxnav.store.files import write_atomic
 from jaxnav.viz import require_plotting_packages
 
+#: Packaged templates; its folder `parts` holds what several of them include.
 PAGES = Path(__file__).parent / "pages"
 READING_MARK = "<!-- reading -->"
 #: Before and after the tables of a page that `jaxnav study` prints.
@@ -123,7 +124,7 @@ def _load_template(template: str) -> jinja2.Template:
     path = PAGES / f"{template}.md"
     if not path.exists():
         path = Path(template)
-    loader = jinja2.FileSystemLoader([path.parent, PAGES])
+    loader = jinja2.FileSystemLoader([path.parent, PAGES, PAGES / "parts"])
     environment = jinja2.Environment(
         loader=loader,
         undefined=jinja2.StrictUndefined,
