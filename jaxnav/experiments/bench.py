@@ -3,6 +3,7 @@
 Measurements ask a `Bench` for what they need, and the bench trains or evaluates what is missing.
 """
 
+import dataclasses
 import hashlib
 import io
 import zipfile
@@ -19,7 +20,7 @@ from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
 from jaxnav.evaluation.grid import EpisodeOutcome
 from jaxnav.evaluation.report import to_report_units
 from jaxnav.evaluation.variants import EvaluationRow
-from jaxnav.experiments.config import AgentRun, ExperimentConfig, agent_runs
+from jaxnav.experiments.config import AgentRun, ExperimentConfig, agent_runs, part_settings
 from jaxnav.experiments.table import ResultRow, ResultTable, read_part
 from jaxnav.plain_console import to_plain_console
 from jaxnav.runs.evaluate import Results, evaluate
@@ -83,15 +84,19 @@ class Bench:
         """Look up the threshold with the greatest success on `val`, at the first shift and in the residual form.
 
         Raises:
-          InputError: the experiment has not been done on `val`.
+          InputError: the experiment has not been done on `val` with these settings.
         """
         folder = self.config.results / "val"
+        settings = part_settings(dataclasses.replace(self.config, split="val"), run, [])
+        del settings["shifts"]  # every shift has a file
         rows: list[ResultRow] = []
         for path in sorted(folder.glob(f"{run.name}-trials-*.jsonl")):
-            rows += read_part(path)
+            rows += read_part(path, settings)
         best = best_epsilon(ResultTable(rows), run.world, run.agent, self.config.shifts[0])
         if best is None:
-            raise InputError(f"{folder}: has no trials of {run.name}; epsilon is chosen there: give --split val first")
+            raise InputError(
+                f"{folder}: has no trials of {run.name} with these settings; epsilon is chosen there: give --split val first"
+            )
         return best
 
     def recall_outcomes(self, name: str, measure: Callable[[], list[EpisodeOutcome]]) -> list[EpisodeOutcome]:

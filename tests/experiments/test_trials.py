@@ -20,6 +20,7 @@ from jaxnav.evaluation.replacements import ReplacedPart
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.evaluation.variants import inference_grid, table_rows
 from jaxnav.experiments.bench import best_epsilon
+from jaxnav.experiments.config import part_settings
 from jaxnav.experiments.table import ResultRow, ResultTable, write_part
 from jaxnav.experiments.trials import (
     NEVER,
@@ -360,7 +361,12 @@ def test_trials_on_test_need_the_threshold_that_was_chosen_on_val(make_bench, dr
         next(measure_trials(bench, run, 0.0))
     assert not run.config.run_dir.exists()
 
-    # It is that of the run's own trials.
+    # It is that of the run's own trials, with the settings of the experiment.
+    settings = part_settings(dataclasses.replace(bench.config, split="val"), run, [])
     for name, epsilon in (("rooms-main-trials-0", 0.3), ("rooms-other-trials-0", 0.7)):
-        write_part(bench.config.results / "val" / f"{name}.jsonl", {}, [success_of_stde(50, epsilon)])
+        write_part(bench.config.results / "val" / f"{name}.jsonl", settings, [success_of_stde(50, epsilon)])
     assert bench.chosen_epsilon(run) == 0.3
+    other_settings = settings | {"seed": settings["seed"] + 1}
+    write_part(bench.config.results / "val" / "rooms-main-trials-0.jsonl", other_settings, [success_of_stde(50, 0.5)])
+    with pytest.raises(InputError, match="with these settings"):
+        bench.chosen_epsilon(run)
