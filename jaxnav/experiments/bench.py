@@ -95,7 +95,8 @@ class Bench:
         best = best_epsilon(ResultTable(rows), run.world, run.agent, self.config.shifts[0])
         if best is None:
             raise InputError(
-                f"{folder}: has no trials of {run.name} with these settings; epsilon is chosen there: give --split val first"
+                f"{folder}: has no trials of {run.name} with these settings, from which epsilon is chosen; "
+                "give --split val first"
             )
         return best
 
