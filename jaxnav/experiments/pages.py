@@ -144,7 +144,7 @@ def _load_template(template: str) -> jinja2.Template:
         "judge_shift": judge_shift,
         "stde_fields": {name: {"variant": "stde", **options._asdict()} for name, options in STDE_NAMES.items()},
         "requested_steps": requested_steps,
-        "total_steps": total_steps,
+        "max_trained_steps": max_trained_steps,
         "differ_only_in_layout": differ_only_in_layout,
         "difference_of_worlds": difference_of_worlds,
         "effect_cells": effect_cells,
@@ -275,7 +275,7 @@ def requested_steps(run: AgentRun) -> int:
     return run.config.total_steps or WORLDS[run.config.world].total_steps
 
 
-def total_steps(runs: Iterable[AgentRun]) -> int:
+def max_trained_steps(runs: Iterable[AgentRun]) -> int:
     """Environment steps of the longest training among runs."""
     return max(run.config.total_updates * run.config.steps_per_update for run in runs)
 
