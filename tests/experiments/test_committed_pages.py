@@ -14,7 +14,7 @@ from jaxnav.experiments import pages
 from jaxnav.experiments.bench import Bench
 from jaxnav.experiments.config import EXPERIMENTS, ExperimentConfig, agent_runs, check_experiment
 from jaxnav.experiments.driver import Part, list_parts, write_pages
-from jaxnav.experiments.pages import READING_MARK, total_steps
+from jaxnav.experiments.pages import READING_MARK, max_trained_steps
 from jaxnav.experiments.table import read_part, write_part
 from jaxnav.policies.methods import find_method
 from jaxnav.policies.methods.local_policy import LocalPolicy
@@ -140,7 +140,7 @@ def test_all_methods_of_a_world_learn_from_as_many_steps(name):
         if run.agent not in ("semexp:NEAREST", "belief"):  # one learns nothing, the other fits predictors
             runs_by_world.setdefault(run.world, []).append(run)
     for runs in runs_by_world.values():
-        assert len({total_steps([run]) for run in runs}) == 1
+        assert len({max_trained_steps([run]) for run in runs}) == 1
         assert {run.config.seeds for run in runs} <= {3, 5}
 
 
