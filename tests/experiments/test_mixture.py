@@ -305,8 +305,11 @@ def test_interrupted_mixtures_keep_finished_outcomes(make_bench, drawn_run, tmp_
     assert len(calls) == 3
 
     # What is damaged is measured again.
-    for path in tmp_path.iterdir():
-        path.write_bytes(path.read_bytes()[:50])
+    cut_path, changed_path = tmp_path.iterdir()
+    cut_path.write_bytes(cut_path.read_bytes()[:50])
+    content = bytearray(changed_path.read_bytes())
+    content[80:120] = bytes(40)  # compressed data
+    changed_path.write_bytes(content)
     assert measure(tmp_path) == expected_rows
     assert len(calls) == 5
 
