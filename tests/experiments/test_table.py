@@ -256,8 +256,7 @@ def test_rows_are_found_by_all_of_their_fields():
 
 
 def test_rows_with_equal_fields_must_have_equal_values():
-    # Experiments may share a folder, and then results such as those of frontier search.
-    # Frontier search meets all scenes, another measurement only those of its episodes.
+    # Experiments may share a folder, and then results such as those of frontier search; scenes are not compared.
     table = ResultTable([make_row(1.0, scenes=80), make_row(1.0, scenes=40)])
     assert table.find(world="rooms", run="org", metric="sr").mean == 1.0
     with pytest.raises(InputError, match="org"):

@@ -86,7 +86,7 @@ def distance(a, b):
     return np.abs(np.subtract(a["params"], b["params"])).max()
 
 
-@pytest.mark.parametrize("devices", params_by_tier([2, 4], slow=[2]))
+@pytest.mark.parametrize("devices", params_by_tier([2, 4], slow=[4]))
 def test_any_number_of_devices_trains_the_same_policies(devices):
     result = trained(1, 4) | (trained(devices) if devices != 4 else {})
     for ours, theirs in zip(result["1"], result[str(devices)], strict=True):
