@@ -140,7 +140,7 @@ def test_paths_without_a_meaning_are_refused_in_every_setting(path, tmp_path, mo
     assert [file.name for file in tmp_path.iterdir()] == ["a.yaml"]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.timeout(900)
 def test_a_run_directory_with_brackets_is_trained_resumed_and_evaluated(tmp_path, monkeypatch, capsys):
     name = os.fsdecode(b"exp[1]\\ \xff")

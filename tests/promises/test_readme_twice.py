@@ -54,15 +54,27 @@ def test_readme_has_a_command_of_each_kind():
     assert {"train", "eval", "sweep", "report", "export", "scenes"} <= names
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_commands_of_the_readme_run_twice(tmp_path):
+@pytest.fixture
+def readme_folder(tmp_path):
+    """A folder with the files that the commands read."""
     write_config(tmp_path)
     (tmp_path / "my_module.py").write_text(AGENT_MODULE)
     (tmp_path / "train.jsonl.gz").write_text("\n".join([json.dumps(HOUSE)] * 10))
+    return tmp_path
 
-    first_files = run_readme(tmp_path)
-    second_files = run_readme(tmp_path)
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_commands_of_the_readme_run(readme_folder):
+    files = run_readme(readme_folder)
+    assert {"runs/houses/config.json", "homes.jsonl.gz"} < files.keys()
+
+
+@pytest.mark.exhaustive
+@pytest.mark.timeout(900)
+def test_commands_of_the_readme_run_twice(readme_folder):
+    first_files = run_readme(readme_folder)
+    second_files = run_readme(readme_folder)
     changed_files = {name for name in first_files | second_files if first_files.get(name) != second_files.get(name)}
     assert changed_files == set()
 

@@ -42,7 +42,7 @@ def outcome_of(results, variant, epsilon=None, decoding="argmax"):
     raise LookupError(variant)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_controlled_direct_effect_adds_rows_and_changes_no_other(run, results):
     plain = jaxnav.evaluate(run, epsilon=THRESHOLDS, episodes=NUM_EPISODES)
     assert [row for row in results.rows if row.variant not in ("cde", "scde")] == plain.rows
@@ -51,7 +51,10 @@ def test_controlled_direct_effect_adds_rows_and_changes_no_other(run, results):
         chex.assert_trees_all_equal(outcome_of(results, row.variant, row.epsilon, row.decoding), expected)
     assert (results.report["compilations"], plain.report["compilations"]) == (2, 1)
 
-    # Soft removal interpolates linearly by default. From epsilon 1 on it removes nothing.
+
+@pytest.mark.slow
+def test_soft_controlled_direct_effect_removes_nothing_from_epsilon_one_on(results):
+    # Soft removal interpolates linearly by default.
     assert {row.form for row in results.rows if row.variant == "scde"} == {"paper"}
     for decoding in ("argmax", "sample"):
         unchanged = outcome_of(results, "scde", 1.0, decoding)

@@ -72,7 +72,7 @@ def kernel(states):
     return np.asarray(states.params["fuse"]["kernel"])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_two_chunks_beside_another_seed_are_one_chunk_alone_bit_for_bit(first, whole):
     second = one_update(first[0], SCALARS, PARAMS, KNOWLEDGE)
     assert_same(tiny.leaves_at(second[0], 0), whole[0])
@@ -112,16 +112,15 @@ def test_another_seed_gives_another_policy(first, seeds):
     assert not np.array_equal(kernel(one_update(rekeyed, SCALARS, PARAMS, KNOWLEDGE)[0])[0], kernel(first[0])[0])
 
 
-@pytest.mark.slow
-def test_metrics_are_finite_scalars(whole):
-    metrics = whole[1]
+def test_metrics_are_finite_numbers_of_every_seed(first):
+    metrics = first[1]
     assert metrics.keys() == METRICS
-    for name, value in metrics.items():
-        assert value.shape == (), name
-        assert value.dtype == jnp.float32, name
-        assert np.isfinite(value), name
-    assert metrics["skipped_steps"] == 0
-    assert metrics["gradient_norm"] > 0
+    for name, values in metrics.items():
+        assert values.shape == (2,), name
+        assert values.dtype == jnp.float32, name
+        assert np.isfinite(values).all(), name
+    assert not metrics["skipped_steps"].any()
+    assert (metrics["gradient_norm"] > 0).all()
 
 
 def test_episode_statistics_are_those_of_the_episodes_that_ended(seeds, first):
