@@ -341,12 +341,17 @@ def measure_groups(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
         num_references = min(len(scores.metrics["sr"]) for scores in references)
         if same_runs:
             num_compared = num_references = min(num_compared, num_references)
-        effect = paired_difference(
-            _mean_sr(references, num_references), _mean_sr(compared, num_compared), clusters, same_runs=same_runs
-        )
         fields = {"world": run.world, "run": name, "variant": variant, "decoding": "argmax", "shift": shift}
-        yield ResultRow(**fields, reference=reference, metric="sr", value=effect)
-        yield ResultRow(**fields, reference=reference, metric="agents", value=Interval(float(len(members))))
+        fields |= {"reference": reference}
+        for metric in ("sr", "spl"):
+            effect = paired_difference(
+                _mean_over_agents(references, metric, num_references),
+                _mean_over_agents(compared, metric, num_compared),
+                clusters,
+                same_runs=same_runs,
+            )
+            yield ResultRow(**fields, metric=metric, value=effect)
+        yield ResultRow(**fields, metric="agents", value=Interval(float(len(members))))
 
 
 def _evaluate_agents(bench: Bench, world: str, agents: Sequence[str], shift: float) -> list[dict[str, VariantScores]]:
@@ -359,6 +364,6 @@ def _evaluate_agents(bench: Bench, world: str, agents: Sequence[str], shift: flo
     return evaluated
 
 
-def _mean_sr(scores: Sequence[VariantScores], num_runs: int) -> np.ndarray:
-    """Average success over agents, run by run, [S, E], in the first S training runs."""
-    return np.mean([variant.metrics["sr"][:num_runs] for variant in scores], axis=0)
+def _mean_over_agents(scores: Sequence[VariantScores], metric: str, num_runs: int) -> np.ndarray:
+    """Average a metric over agents, run by run, [S, E], in the first S training runs."""
+    return np.mean([variant.metrics[metric][:num_runs] for variant in scores], axis=0)

@@ -218,6 +218,8 @@ def test_groups_compare_two_variants_of_their_agents(measured_groups):
         effect = table.find(fields, metric="sr")
         assert effect.mean == pytest.approx(25.0)
         assert effect.seeds == pytest.approx((50 / 3, 100 / 3))
+        # Successful episodes are twice as long as needed.
+        assert table.find(fields, metric="spl").mean == pytest.approx(12.5)
         assert table.find(fields, metric="agents").mean == 2
 
 
