@@ -53,7 +53,8 @@ def test_interrupted_run_saves_and_resumes_bit_for_bit(whole, tmp_path, capsys):
     assert process.returncode == 130, error
     message = error.splitlines()[-1]
     match = re.fullmatch(
-        rf"interrupted: {re.escape(str(ended))}: stopped after update (\d+) of 60 and saved; run the same command again to continue",
+        rf"interrupted: {re.escape(str(ended))}: stopped after update (\d+) of 60 and saved; "
+        "run the same command again to continue",
         message,
     )
     assert match, error
