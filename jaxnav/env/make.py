@@ -10,12 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxnav.choices import ShiftKind, Split
 from jaxnav.env.objectnav import EnvParams, ObjectNav, SceneTables, prior_index
 from jaxnav.env.render import SceneRenderers
 from jaxnav.errors import InputError
 from jaxnav.scenes.tables.compile import Bank, compile_bank
 from jaxnav.scenes.task import Task
-from jaxnav.scenes.worlds import WORLDS, Scenes, load_scenes, make_generated_scenes, shift_scenes
+from jaxnav.scenes.worlds import WORLDS, SceneSource
+from jaxnav.store.files import expand_home
 
 _SUCCESS_REWARD = 5.0
 _STEP_REWARD = -0.01
@@ -23,11 +25,12 @@ _STEP_REWARD = -0.01
 
 def make(
     world: str = "rooms",
-    split: str = "train",
+    split: Split = "train",
     scenes: str | Path | None = None,
     task: Task | None = None,
     seed: int = 0,
     shift: float = 0.0,
+    shift_by: ShiftKind = "size",
 ) -> tuple[ObjectNav, EnvParams]:
     """Make an environment and its parameters.
 
@@ -38,12 +41,15 @@ def make(
       task: task that replaces the world's own.
       seed: seed of the generated scenes, and of the layout shift.
       shift: layout shift in [0, 1], the share of the categories that exchange their places.
+      shift_by: categories that exchange their places. `size`: neighbours in size. `context`: those whose exchange
+        misleads most, fitted to the training scenes of the world or file.
 
     Returns:
       The environment, and its parameters with the compiled scenes.
 
     Raises:
-      InputError: unknown world or split, bad scene file, or no scene with a reachable goal.
+      InputError: unknown world or split, bad scene file, no scene with a reachable goal, or no exchange by context that
+        misleads.
     """
     if world not in WORLDS:
         raise InputError(f"world {world!r}: choose one of {', '.join(WORLDS)}, or give a scene file as `scenes`")
@@ -51,10 +57,9 @@ def make(
     task = task or world_config.task
 
     # Scenes, shifted and compiled.
-    unshifted_scenes: Scenes = (
-        make_generated_scenes(world, split, None, seed) if scenes is None else load_scenes(scenes, split)
-    )
-    shifted_scenes = shift_scenes(unshifted_scenes, task, shift, seed)
+    # A whole path is never taken for the name of a world.
+    file = world if scenes is None else str(expand_home(scenes).absolute())
+    shifted_scenes = SceneSource(file, split, seed, shift, shift_by).open(task)
     bank = compile_bank((shifted_scenes[scene_index] for scene_index in range(len(shifted_scenes))), task)
 
     # Training has its own step limit, and may shape rewards and starts.

@@ -6,7 +6,7 @@
 
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxnav.causal import FORMS
 from jaxnav.choices import Form, Removal, RowDecoding, Variant
-from jaxnav.errors import InputError
+from jaxnav.errors import InputError, check_choice
 from jaxnav.evaluation.episodes import MAX_EPISODES
 from jaxnav.evaluation.removal import GapSource, InferenceConfig, RemovedLogits
 from jaxnav.evaluation.replacements import ReplacedPart
@@ -77,12 +77,14 @@ def table_rows(
       default_form: form of sTDE if `forms` is None.
 
     Raises:
-      InputError: no kind of removal, no epsilon, or one outside [0, inf), or NaN.
+      InputError: no kind of removal or an unknown one, an unknown form, no epsilon, or one outside [0, inf), or NaN.
     """
     if not epsilons:
         raise InputError("--epsilon: give at least one number")
     if not removals:
         raise InputError("--removal: give tde, cde or both")
+    for removal in removals:
+        check_choice("--removal", removal, get_args(Removal))
     default_forms: Mapping[Removal, Form] = {"tde": default_form, "cde": "paper"}
 
     # Best actions first, then sampled ones: the order of the printed table.
@@ -106,8 +108,10 @@ def table_row(variant: Variant, epsilon: float | None, form: Form | None, decodi
     """Make one row, dropping the settings that its variant does not use.
 
     Raises:
-      InputError: an epsilon outside [0, inf), or NaN.
+      InputError: an unknown form or decoding, or an epsilon outside [0, inf), or NaN.
     """
+    check_choice("--form", form, FORMS)
+    check_choice("--decoding", decoding, get_args(RowDecoding))
     if variant in ("tde", "cde"):
         return EvaluationRow(variant, None, "paper", decoding)  # equation 1
     if variant not in ("stde", "scde"):

@@ -35,7 +35,7 @@ from jaxnav.runs.subjects import AgentSubject, PolicySubject, find_subject
 from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world, draw_episode_lists
 from jaxnav.scenes.tables.compile import bank_checksum
 from jaxnav.scenes.task import FrontCell
-from jaxnav.store.files import write_atomic
+from jaxnav.store.files import expand_home, write_atomic
 
 #: Benchmarks by name.
 BENCHMARKS = {path.stem: path for path in sorted((Path(__file__).parent / "benchmarks").glob("*.yaml"))}
@@ -147,7 +147,7 @@ class BenchmarkScores(NamedTuple):
     rows: list[dict[str, Any]]
     track_results: list[TrackResults]
 
-    def write(self, path: Path) -> None:
+    def write(self, path: str | Path) -> None:
         """Write the scores as JSON, and beside them a compressed CSV file with a line per row, seed and episode.
 
         Raises:
@@ -160,6 +160,7 @@ class BenchmarkScores(NamedTuple):
             "versions": package_versions(),
             "format": SCORES_FORMAT,
         }
+        path = expand_home(path)
         write_atomic(path, (json.dumps(scores, indent=1, allow_nan=False) + "\n").encode())
         csv_path = path.with_name(f"{path.name.removesuffix('.json')}.episodes.csv.gz")
         write_atomic(csv_path, gzip.compress(_format_episodes(self.track_results).encode(), mtime=0))

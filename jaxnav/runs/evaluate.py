@@ -8,7 +8,7 @@ compares results with those of layout-blind agents, and `replay_episodes` plays 
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from rich.table import Table
 
 from jaxnav.baselines.shortest_path import run_oracle
 from jaxnav.choices import Costs, CounterfactualMemory, Decoding, EstimatorName, Form, Removal, ShiftKind
-from jaxnav.errors import InputError
+from jaxnav.errors import InputError, check_choice
 from jaxnav.evaluation.episodes import EpisodeList, join_episode_lists
 from jaxnav.evaluation.grid import EpisodeOutcome, Evaluator, episode_metrics, start_states
 from jaxnav.evaluation.notes import budget_note, convergence_note, decision_share_notes, evaluation_notes
@@ -85,16 +85,16 @@ def evaluate(
     subject: Any,
     *,
     split: str = "val",
-    scenes: Path | None = None,
+    scenes: str | Path | None = None,
     world: str | None = None,
     shift: float | None = None,
     shift_by: ShiftKind = "size",
     episodes: int = 1000,
-    epsilon: Sequence[float] | np.ndarray = (0.5,),
-    form: Sequence[Form] | None = None,
+    epsilon: float | Sequence[float] | np.ndarray = (0.5,),
+    form: Form | Sequence[Form] | None = None,
     setting: EstimatorName | None = None,
     hold: bool = False,
-    removal: Sequence[Removal] = ("tde",),
+    removal: Removal | Sequence[Removal] = ("tde",),
     counterfactual_memory: CounterfactualMemory | None = None,
     inner_steps: int | None = None,
     costs: Costs = "categories",
@@ -122,13 +122,13 @@ def evaluate(
       shift_by: categories that exchange their places: neighbours in size (`size`), or the ones whose exchange misleads
         most (`context`); see `exchange_places`.
       episodes: number of fixed episodes, balanced over room types and scenes.
-      epsilon: thresholds of soft removal.
-      form: forms in which soft removal combines the logits; None for the form of the run's layout estimator with sTDE,
-        and for a - s (a - a0) with sCDE.
+      epsilon: thresholds of soft removal, or one of them.
+      form: forms, or one form, in which soft removal combines the logits; None for the form of the run's layout
+        estimator with sTDE, and for a - s (a - a0) with sCDE.
       setting, hold: layout estimator to use in place of the run's; see `Policies.with_estimator`.
-      removal: quantities that a complete removal leaves: `tde`, the total direct effect (eq. 1), with the variants
-        `tde` and `stde`; `cde`, the decision of the same network under do(Z = 0), with the variants `cde` and `scde`,
-        which take a compiled call of their own; see `Policies.with_own_fallback`.
+      removal: quantities, or one quantity, that a complete removal leaves: `tde`, the total direct effect (eq. 1), with
+        the variants `tde` and `stde`; `cde`, the decision of the same network under do(Z = 0), with the variants `cde`
+        and `scde`, which take a compiled call of their own; see `Policies.with_own_fallback`.
       counterfactual_memory: memory from which the counterfactual branch decides; see
         `Policies.with_counterfactual_memory`.
       inner_steps: limit of adaptation steps in an episode; see `Policies.with_inner_steps`.
@@ -143,15 +143,20 @@ def evaluate(
         impossible.
     """
     check_seed(seed)
+    check_choice("--costs", costs, get_args(Costs))
     console = to_plain_console(console)
+    epsilons = np.atleast_1d(np.asarray(epsilon, float)).tolist()
+    forms = (form,) if isinstance(form, str) else form
+    removals = (removal,) if isinstance(removal, str) else tuple(removal)
+    scenes = None if scenes is None else expand_home(scenes)
     found_subject = find_subject(subject)
     if isinstance(found_subject, AgentSubject):
         policy_options = {
-            "epsilon": tuple(epsilon) != (0.5,),
+            "epsilon": epsilons != [0.5],
             "form": form is not None,
             "setting": setting is not None,
             "hold": hold,
-            "removal": tuple(removal) != ("tde",),
+            "removal": removals != ("tde",),
             "counterfactual_memory": counterfactual_memory is not None,
             "inner_steps": inner_steps is not None,
             "costs": costs != "categories",
@@ -174,12 +179,12 @@ def evaluate(
     config = found_subject.config
     policies = found_subject.policies.with_estimator(setting, hold).with_inner_steps(inner_steps)
     policies = policies.with_counterfactual_memory(counterfactual_memory)
-    if "cde" in removal:
+    if "cde" in removals:
         policies.with_own_fallback()  # refuses policies that cannot act without experience
 
     # Run the rows of the table: variants, thresholds and forms, with best and with sampled actions.
     default_form = "residual" if policies.estimator_config is None else policies.estimator_config.form
-    rows = table_rows(np.asarray(epsilon, float).tolist(), form, policies.arms, removal, default_form)
+    rows = table_rows(epsilons, forms, policies.arms, removals, default_form)
     compiled = compiled or compile_evaluation_world(config, split, scenes, shift, console, world, shift_by)
     applied_shift = evaluation_shift(config, scenes or world, shift)
     table = _evaluate_table(rows, costs, policies, compiled, episodes, applied_shift, seed, console)
@@ -540,11 +545,11 @@ class Sweep(NamedTuple):
 
 def sweep(
     source: Run | LoadedPolicy | str | Path,
-    epsilon: Sequence[float] | np.ndarray = SWEPT_THRESHOLDS,
+    epsilon: float | Sequence[float] | np.ndarray = SWEPT_THRESHOLDS,
     params: Any = None,
     *,
     split: str = "val",
-    scenes: Path | None = None,
+    scenes: str | Path | None = None,
     world: str | None = None,
     shift: float | None = None,
     shift_by: ShiftKind = "size",
@@ -593,12 +598,12 @@ def sweep(
 
 def sweep_shifts(
     source: Run | LoadedPolicy | str | Path,
-    epsilon: Sequence[float] | np.ndarray = SWEPT_THRESHOLDS,
+    epsilon: float | Sequence[float] | np.ndarray = SWEPT_THRESHOLDS,
     shifts: Sequence[float | None] = (0.0, 1.0),
     params: Any = None,
     *,
     split: str = "val",
-    scenes: Path | None = None,
+    scenes: str | Path | None = None,
     world: str | None = None,
     shift_by: ShiftKind = "size",
     episodes: int = 1000,
@@ -616,7 +621,9 @@ def sweep_shifts(
     """
     check_seed(seed)
     console = to_plain_console(console)
-    if not len(epsilon):
+    scenes = None if scenes is None else expand_home(scenes)
+    epsilons = np.atleast_1d(np.asarray(epsilon, np.float64))
+    if not len(epsilons):
         raise InputError("--epsilon: give at least one number")
     config, policies = _load_layout_policies(source, setting, hold)
     estimator_config = policies.estimator_config
@@ -631,7 +638,7 @@ def sweep_shifts(
 
     # One row for each threshold, and one without removal for the differences.
     form = estimator_config.form if form is None else form
-    rows = [table_row("stde", float(threshold), form, decoding) for threshold in epsilon]
+    rows = [table_row("stde", float(threshold), form, decoding) for threshold in epsilons]
     rows.append(table_row("layout", None, None, decoding))
 
     results = []
@@ -641,7 +648,7 @@ def sweep_shifts(
         compiled = compile_evaluation_world(config, split, scenes, shift, console, world, shift_by)
         num_seeds = policies.num_seeds
         seed_text = "1 seed" if num_seeds == 1 else f"{num_seeds} seeds"
-        console.print(f"shift {applied_shift:g}: {len(epsilon)} thresholds x {seed_text} x {episodes:,} episodes")
+        console.print(f"shift {applied_shift:g}: {len(epsilons)} thresholds x {seed_text} x {episodes:,} episodes")
 
         # The agent loop depends on the task and the policy alone, so one evaluator serves all shifts.
         evaluator = evaluator or Evaluator(policies.make_agent_loop(compiled), has_controls=False)
@@ -668,7 +675,7 @@ def sweep_shifts(
             "seed": seed,
         }
         result = Sweep(
-            epsilon=np.asarray(epsilon, np.float64),
+            epsilon=epsilons,
             sr=metrics["sr"],
             spl=metrics["spl"],
             dts=metrics["dts"],

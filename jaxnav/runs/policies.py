@@ -19,7 +19,7 @@ import numpy as np
 
 from jaxnav.choices import CounterfactualMemory, EstimatorName, GapName
 from jaxnav.env.objectnav import NUM_PRIORS, Observation
-from jaxnav.errors import InputError
+from jaxnav.errors import InputError, check_choice
 from jaxnav.gaps import NUM_NEAR_FEATURES, CooccurrenceEvidence
 from jaxnav.layout import ESTIMATORS, EstimatorConfig
 from jaxnav.policies.adaptation import limit_inner_steps
@@ -110,11 +110,12 @@ class Policies(NamedTuple):
           hold: keep the gap from falling within an episode.
 
         Raises:
-          InputError: no policy uses the layout, the run learned no co-occurrence evidence, which `learned`, `surprise`
-            and `overdue` need, or the counts that `paper` and `released` need are not in memory.
+          InputError: an unknown name, no policy uses the layout, the run learned no co-occurrence evidence, which
+            `learned`, `surprise` and `overdue` need, or the counts that `paper` and `released` need are not in memory.
         """
         if name is None and not hold:
             return self
+        check_choice("--setting", name, get_args(EstimatorName))
 
         # Refuse an estimator for which the run has no data.
         if self.estimator_config is None:
@@ -240,10 +241,11 @@ class Policies(NamedTuple):
         """Policies whose counterfactual branch decides from a given memory; None keeps that of the training.
 
         Raises:
-          InputError: the policies were trained without a memory of the branch itself.
+          InputError: an unknown name, or the policies were trained without a memory of the branch itself.
         """
         if memory is None:
             return self
+        check_choice("--counterfactual-memory", memory, get_args(CounterfactualMemory))
         if memory == "own" and self.spec.counterfactual_memory != "own":
             raise InputError(
                 "--counterfactual-memory own: the counterfactual branch of these policies was trained without a memory "

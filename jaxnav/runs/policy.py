@@ -17,10 +17,10 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxnav import __version__
-from jaxnav.causal import do, remove_experience
+from jaxnav.causal import FORMS, do, remove_experience
 from jaxnav.choices import EstimatorName, Form
 from jaxnav.env.objectnav import OTHER_ROOM, ObjectNav, Observation, prior_index
-from jaxnav.errors import InputError
+from jaxnav.errors import InputError, check_choice
 from jaxnav.layout import EstimatorConfig
 from jaxnav.policies.agent_loop import Perception, PerceptionState, decide
 from jaxnav.policies.method import Knowledge, Percept
@@ -245,9 +245,11 @@ def load_policy(
       env: environment in which the policy will act, to check that they fit; None skips the check.
 
     Raises:
-      InputError: the export is missing or damaged, its method cannot be found, the setting is impossible, or the policy
-        was trained with other categories or rules than `env` has.
+      InputError: the export is missing or damaged, its method cannot be found, the setting or form is impossible, or
+        the policy was trained with other categories or rules than `env` has.
     """
+    check_choice("--form", form, FORMS)
+
     # The layout estimator may replace the one in the export.
     policies = read_exported_policy(find_policy_folder(path)).with_estimator(setting, hold)
     estimator_config = policies.estimator_config

@@ -11,7 +11,7 @@ from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.grid import EpisodeOutcome, episode_metrics
 from jaxnav.evaluation.report import build_row, markdown_table, write_report
 from jaxnav.evaluation.variants import EvaluationRow
-from jaxnav.store.files import write_atomic
+from jaxnav.store.files import expand_home, write_atomic
 
 
 class Results(NamedTuple):
@@ -47,13 +47,14 @@ class Results(NamedTuple):
         """
         return episode_metrics(self.outcome, self.episodes.best_length, self.budgets)
 
-    def write(self, path: Path) -> None:
+    def write(self, path: str | Path) -> None:
         """Write the report, and next to it a CSV file with a line per row, seed and episode.
 
         Raises:
           OSError: a file cannot be written.
         """
         # `eval-val.json` is accompanied by `eval-val.episodes.csv`.
+        path = expand_home(path)
         write_report(path, self.report)
         csv_path = path.with_name(f"{path.name.removesuffix('.json')}.episodes.csv")
         write_atomic(csv_path, _format_csv(self).encode())

@@ -9,6 +9,7 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from rich.console import Console
@@ -17,7 +18,7 @@ from rich.progress import Progress
 from jaxnav.choices import ShiftKind
 from jaxnav.env.make import build_environment
 from jaxnav.env.objectnav import EnvParams, ObjectNav
-from jaxnav.errors import InputError
+from jaxnav.errors import InputError, check_choice
 from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
 from jaxnav.plain_console import PlainConsole, to_plain_console
 from jaxnav.policies.method import Knowledge, Method
@@ -134,15 +135,13 @@ def compile_evaluation_world(
       shift_by: categories that exchange their places; `context` is fitted to the training scenes of the run.
 
     Raises:
-      InputError: unknown split or world, bad scene file, no scene of the split, a bad shift, no exchange by context
-        that misleads, or both a file and a world.
+      InputError: unknown split, world or kind of shift, bad scene file, no scene of the split, a bad shift, no exchange
+        by context that misleads, or both a file and a world.
     """
     console = to_plain_console(console)
     world_name = world or config.world
-    if split not in SPLITS:
-        raise InputError(f"--split {split}: choose one of {', '.join(SPLITS)}")
-    if world_name not in WORLDS:
-        raise InputError(f"--world {world_name}: choose one of {', '.join(WORLDS)}")
+    check_choice("--split", split, SPLITS)
+    check_choice("--world", world_name, WORLDS)
     if scenes and world:
         raise InputError(f"--scenes, --world: both are given ({scenes}, {world}); give only one")
 
@@ -177,6 +176,7 @@ def _load_scenes(
     shift_by: ShiftKind = "size",
 ) -> Scenes:
     """Read or generate the scenes of a split, and shift their layout."""
+    check_choice("--shift-by", shift_by, get_args(ShiftKind))
     context_exchange = fit_run_exchange(config) if shift and shift_by == "context" else None
     # The seed of the generator also decides which categories exchange their places.
     seed = config.worlds.seed

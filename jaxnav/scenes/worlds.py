@@ -11,12 +11,12 @@ import functools
 import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, get_args
 
 import numpy as np
 
 from jaxnav.choices import ShiftKind, Split, WorldName
-from jaxnav.errors import InputError, MissingSplitError
+from jaxnav.errors import InputError, MissingSplitError, check_choice
 from jaxnav.scenes.context_exchange import ContextExchange, fit_context_exchange
 from jaxnav.scenes.files.scene_file import iterate_scenes, read_bytes, read_scenes, remove_headers
 from jaxnav.scenes.generate.homes import generate_apartment, generate_house
@@ -282,9 +282,8 @@ def make_generated_scenes(world: str, split: str, count: int | None = None, seed
       InputError: an unknown name, or an impossible number.
     """
     # Check the names before the numbers, whose default depends on them.
-    if world not in WORLDS:
-        raise InputError(f"world {world!r}: choose one of {', '.join(WORLDS)}")
-    _check_split(split)
+    check_choice("--world", world, WORLDS)
+    check_choice("--split", split, SPLITS)
     count = WORLDS[world].counts[split] if count is None else count
     if not 1 <= count <= _MAX_GENERATED_SCENES:
         expected = f"request 1 to {_MAX_GENERATED_SCENES:,}"
@@ -307,7 +306,7 @@ def load_scenes(path: str | Path, split: str | None) -> FileScenes:
     """
     # An unknown name of a split is reported before the file is read.
     if split is not None:
-        _check_split(split)
+        check_choice("--split", split, SPLITS)
     scenes = read_scenes(path)
     scenes_of_split = tuple(scene for scene in scenes if split in (None, scene.split))
     if not scenes_of_split:
@@ -317,11 +316,6 @@ def load_scenes(path: str | Path, split: str | None) -> FileScenes:
     # The identity follows the scenes of the file, not its name or the account of its import.
     file_checksum = hashlib.sha256(remove_headers(read_bytes(expand_home(path)))).hexdigest()
     return FileScenes(scenes_of_split, f"{split or 'all'} of {file_checksum}")
-
-
-def _check_split(split: str) -> None:
-    if split not in SPLITS:
-        raise InputError(f"split {split!r}: choose one of {', '.join(SPLITS)}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -376,9 +370,10 @@ class SceneSource:
           count: number of scenes of a generated world; None for its usual number.
 
         Raises:
-          InputError: no readable scene file, no scene of the split, or an impossible number.
+          InputError: no readable scene file, no scene of the split, an impossible number, or an unknown kind of shift.
         """
         # Names of worlds come before files of the same name.
+        check_choice("--shift-by", self.shift_by, get_args(ShiftKind))
         task = task or self.task
         scenes = self._open_split(self.split, count)
         if not (self.shift and self.shift_by == "context"):

@@ -13,9 +13,10 @@ from jaxnav.errors import InputError
 from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.scenes.files.scene_file import write_scenes
 from jaxnav.scenes.generate.rooms import generate_room
+from jaxnav.scenes.layout_shift import exchange_places
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.task import Task
-from jaxnav.scenes.worlds import WORLDS, make_generated_scenes
+from jaxnav.scenes.worlds import WORLDS, fit_scene_exchange, make_generated_scenes
 
 #: A book and a television, both of which are goals in every world.
 GOALS_ROOM = draw(["."], ("Book", 0, 1.0, 0.5, *SMALL), ("Television", 0, 1.0, 0.5, *SMALL))
@@ -77,6 +78,26 @@ def test_make_takes_a_scene_file_and_a_task(tmp_path):
     env, params = make("rooms", "val", path, task)
     assert (env.task, env.categories, env.num_actions) == (task, ("Television", "Sink"), 6)
     assert params.tables.ahead.shape[1] == 12
+
+
+def test_make_shifts_layouts_by_size_or_by_context(tmp_path):
+    train_scenes = [generate_room("train", index, 0) for index in range(8)]
+    val_scenes = [generate_room("val", index, 0) for index in range(4)]
+    path = tmp_path / "rooms.jsonl.gz"
+    write_scenes(path, [*train_scenes, *val_scenes])
+
+    # The exchange by context is fitted to the training scenes.
+    task = WORLDS["rooms"].task
+    exchanges = {"size": None, "context": fit_scene_exchange(train_scenes, task)}
+    rows_by_kind = {}
+    for kind, exchange in exchanges.items():
+        _, params = make("rooms", "val", path, shift=1.0, shift_by=kind)
+        bank = compile_bank([exchange_places(scene, task, 1.0, 0, exchange) for scene in val_scenes], task)
+        np.testing.assert_array_equal(params.tables.rows, bank.rows)
+        rows_by_kind[kind] = bank.rows
+    assert not np.array_equal(rows_by_kind["size"], rows_by_kind["context"])
+    with pytest.raises(InputError, match=r"^--shift-by 'colour': choose one of size, context"):
+        make("rooms", "val", path, shift=1.0, shift_by="colour")
 
 
 @pytest.mark.parametrize(

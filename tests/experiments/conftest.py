@@ -24,7 +24,7 @@ def drawn_run(tmp_path_factory) -> Run:
 @pytest.fixture(scope="session")
 def evaluated(drawn_run) -> jaxnav.Results:
     """The evaluation of the run at shift 0, as `jaxnav eval` does it."""
-    return jaxnav.evaluate(drawn_run, shift=0.0, episodes=EPISODES, form=("residual",))
+    return jaxnav.evaluate(drawn_run, shift=0.0, episodes=EPISODES, form="residual")
 
 
 @pytest.fixture

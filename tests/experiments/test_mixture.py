@@ -333,7 +333,7 @@ def test_cde_leaves_the_network_without_experience(make_bench, drawn_run, tmp_pa
         assert table.find(row_fields, variant="CDE", shift=shift, metric="weight").mean == 1.0
 
     # The same numbers as in the evaluation of the run.
-    results = evaluate(run["run"], episodes=8, removal=("cde",), shift=0.0)
+    results = evaluate(run["run"], episodes=8, epsilon=0.5, removal="cde", shift=0.0)
     metrics = results.metrics()
     rows = {(row.variant, row.decoding): index for index, row in enumerate(results.rows)}
     for metric in ("sr", "spl"):

@@ -140,7 +140,20 @@ def test_results_are_written_as_json_and_csv(evaluated, tmp_path):
         evaluated.write(report_file / "table.json")
 
 
-@pytest.mark.parametrize(("option", "value"), [("world", "cellar"), ("split", "all")])
-def test_evaluate_refuses_unknown_worlds_and_splits(drawn_run, option, value):
-    with pytest.raises(InputError, match=rf"^--{option} {value}: choose one of "):
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("world", "cellar"),
+        ("split", "all"),
+        ("shift_by", "colour"),
+        ("form", "plain"),
+        ("removal", "ted"),
+        ("setting", "learnt"),
+        ("costs", "category"),
+        ("counterfactual_memory", "none"),
+    ],
+)
+def test_evaluate_refuses_names_that_it_does_not_accept(drawn_run, option, value):
+    # A misspelt word would otherwise select a default, or fail after the scenes are compiled.
+    with pytest.raises(InputError, match=rf"^--{option.replace('_', '-')} '{value}': choose one of "):
         jaxnav.evaluate(drawn_run, **{option: value})

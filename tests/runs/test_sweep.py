@@ -93,6 +93,12 @@ def test_sweep_refuses_impossible_arguments(drawn_run, arguments, problem):
             call(drawn_run, **arguments)
 
 
+@pytest.mark.parametrize("option", ["decoding", "form", "setting", "split", "world", "shift_by"])
+def test_sweep_refuses_names_that_it_does_not_accept(drawn_run, option):
+    with pytest.raises(InputError, match=rf"^--{option.replace('_', '-')} 'best': choose one of "):
+        jaxnav.sweep(drawn_run, EPSILON, **{option: "best"})
+
+
 def test_sweep_refuses_runs_without_the_layout(drawn_run, tmp_path):
     baseline = Run(dataclasses.replace(drawn_run.config, arms=("baseline",)))
     with pytest.raises(InputError, match="was trained without the arm 'layout'; train a run with both --arms"):
