@@ -1,7 +1,9 @@
 """The study command: run an experiment, from training to its pages."""
 
 import argparse
+import dataclasses
 import sys
+from pathlib import Path
 
 from rich.console import Console
 
@@ -51,7 +53,14 @@ def parse_study(arguments: list[str] | None, prog: str = "jaxnav study") -> Expe
     if not words:
         raise InputError(f"give an experiment: {', '.join(EXPERIMENTS)}, or a YAML file")
     words = _select_version(words)
-    return parse_config(ExperimentConfig(), words, prog, DESCRIPTION, _check, EXPERIMENTS, is_positional=True)
+    config = parse_config(ExperimentConfig(), words, prog, DESCRIPTION, _check, EXPERIMENTS, is_positional=True)
+
+    # Pages stay beside other results, so that those of the stored ones are not replaced.
+    options = {word.partition("=")[0] for word in words}
+    if "--results" in options and "--pages" not in options:
+        pages = {str(config.results / Path(document).name): template for document, template in config.pages.items()}
+        config = dataclasses.replace(config, pages=pages)
+    return config
 
 
 def _select_version(words: list[str]) -> list[str]:

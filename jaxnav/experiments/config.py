@@ -39,7 +39,8 @@ class ExperimentConfig:
         `results` of the run directory.
       runs: folder of the training runs of the experiment.
       pages: pages to write, as YAML that maps each Markdown document to its template: a file, or one of the packaged
-        templates account, claims, factors, instrument, methods, mixture, paper and study.
+        templates account, claims, factors, instrument, methods, mixture, paper and study. With the option `--results`
+        and without `--pages`, pages are written to the folder of the results.
       worlds: worlds by name, as YAML. Each maps settings of `jaxnav train` to the values of all runs in that world.
       folds: datasets that are divided into folds, as YAML that maps the name of a dataset to a list of its worlds. Each
         of these worlds evaluates one fold with agents trained on other scenes of the dataset. The measurements

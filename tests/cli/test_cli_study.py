@@ -66,6 +66,15 @@ def test_a_smaller_version_is_an_experiment_of_its_own(capsys):
     assert "table3 has no other version; omit --config" in refusal(capsys)
 
 
+def test_pages_of_other_results_are_written_beside_them():
+    pages = {"docs/few_scenes.md": "factors"}
+    assert parse_study(["few_scenes"]).pages == pages
+    # Stored pages are replaced only if the command names them.
+    assert parse_study(["few_scenes", "--results", "new/results"]).pages == {"new/results/few_scenes.md": "factors"}
+    assert parse_study(["few_scenes", "--results=new"]).pages == {"new/few_scenes.md": "factors"}
+    assert parse_study(["few_scenes", "--results", "new", "--pages", "{docs/few_scenes.md: factors}"]).pages == pages
+
+
 def test_study_lists_the_experiments_for_an_unknown_one(capsys):
     assert study("studdy") == 2
     error = refusal(capsys)
