@@ -8,9 +8,10 @@ the paper's *experience*: features of what tends to stand near what, learned in 
     S, G -> Z -> A
 
 Let a be the logits of the factual decision, a_bar the logits under do(S = 0, G = 0) with the factual experience Z and
-the factual memory (hidden state, previous action), D the layout gap, and epsilon its threshold:
+the memory of the counterfactual branch (by default the factual one: hidden state and previous action), D the layout
+gap, and epsilon its threshold:
 
-    counterfactual = policy.decide(do(pathways, scene=0.0, goal=0.0), memory).logits
+    counterfactual = policy.decide(do(pathways, scene=0.0, goal=0.0), memory.counterfactual_state()).logits
     tde(logits, counterfactual)                    # eq. 1: a - a_bar
     stde(logits, counterfactual, gap, epsilon)     # eq. 2: subtracts a_bar, weighted by how far D exceeds epsilon
 
@@ -28,10 +29,10 @@ from jaxnav.choices import Form
 
 #: Forms in which equation 2 combines the logits, see `stde`.
 FORMS: tuple[Form, ...] = typing.get_args(Form)
-Pathways = TypeVar("Pathways", bound=Any)
+PathwaysT = TypeVar("PathwaysT", bound=Any)
 
 
-def do(pathways: Pathways, **interventions: jax.Array | float) -> Pathways:
+def do(pathways: PathwaysT, **interventions: jax.Array | float) -> PathwaysT:
     """Set pathways to given values (the do-operator); fields that are not named keep their factual values.
 
     Args:
@@ -174,8 +175,9 @@ def remove_experience(
 
     Args:
       logits, counterfactual, gap, epsilon, form: as in `stde`.
-      has_additive_scores: whether the logits are the counterfactual ones plus direct scores, without rounding. The form
-        `residual` is no removal from a sum, and stays that of `stde`.
+      has_additive_scores: whether the logits are log probabilities of detection, direct scores plus the counterfactual
+        ones, and their sum is exact. The form `mixture` then mixes without normalizing each decision, and complete
+        removal restores the direct scores to the bit. The form `residual` is that of `stde` for sums, too.
 
     Returns:
       float [..., A].

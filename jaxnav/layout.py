@@ -141,9 +141,11 @@ def resolve_estimator(config: str | EstimatorConfig) -> EstimatorConfig:
     if isinstance(config, EstimatorConfig):
         return config
     if config not in ESTIMATORS:
+        if config in typing.get_args(GapName):
+            raise ValueError(f"estimator {config!r} is the name of a gap: give EstimatorConfig(gap={config!r})")
         nearest_name = difflib.get_close_matches(config, ESTIMATORS, n=1, cutoff=0.0)[0]
         raise ValueError(
-            f"setting {config!r} is unknown: did you mean {nearest_name!r}? Known: {', '.join(ESTIMATORS)}"
+            f"estimator {config!r} is unknown: did you mean {nearest_name!r}? Known: {', '.join(ESTIMATORS)}"
         )
     return ESTIMATORS[config]
 
@@ -184,7 +186,7 @@ class LayoutState(struct.PyTreeNode):
     Attributes:
       alpha: float32 [K, K], concentrations; 0 on the diagonal unless a row counts its own category.
       last_visible: bool [K], the visible set accepted last.
-      gap: float32 [], layout gap D in [0, 1] (1 only by rounding).
+      gap: float32 [], layout gap D in [0, 1].
       co_seen: bool [K, K], pairs that were visible together so far (`seen_together`), for the gaps `learned` and
         `overdue`; None for the rest.
       sightings: where the categories were seen so far, for the gap `surprise`; None for the rest.
@@ -225,10 +227,15 @@ class LayoutEstimator(struct.PyTreeNode):
     def __post_init__(self):
         resolve_estimator(self.config)  # raises on an unknown name
 
+    @property
+    def resolved_config(self) -> EstimatorConfig:
+        """The configuration, also where `config` is a name."""
+        return resolve_estimator(self.config)
+
     def init(self) -> LayoutState:
         """Belief at the start of an episode."""
         num_categories = self.prior.shape[-1]
-        gap_name = resolve_estimator(self.config).gap
+        gap_name = self.resolved_config.gap
         records_pairs = gap_name in ("learned", "overdue")
         return LayoutState(
             alpha=self.prior,
@@ -260,7 +267,7 @@ class LayoutEstimator(struct.PyTreeNode):
         Raises:
           ValueError: the gap needs `cooccurrence`, a goal or the geometry of the view, and there is none.
         """
-        config = resolve_estimator(self.config)
+        config = self.resolved_config
         is_visible = presence.astype(bool)
         visible = is_visible.astype(jnp.float32)
         diagonal = jnp.eye(len(is_visible), dtype=jnp.float32)
@@ -318,7 +325,8 @@ class LayoutEstimator(struct.PyTreeNode):
         Returns:
           float32 [K, K].
         """
-        return jax.vmap(LayoutEstimator.goal_weights, (None, 0), 1)(state, jnp.arange(state.alpha.shape[-1]))
+        row_means = state.alpha / state.alpha.sum(-1, keepdims=True)
+        return row_means + jnp.eye(state.alpha.shape[-1], dtype=row_means.dtype)
 
     @staticmethod
     def goal_weights(state: LayoutState, goal: jax.Array | int) -> jax.Array:
@@ -337,7 +345,7 @@ class LayoutEstimator(struct.PyTreeNode):
           counts: float32 [K, K], counts of the step.
           visible: float32 [K], 1 where a category is visible.
         """
-        config = resolve_estimator(self.config)
+        config = self.resolved_config
         if config.gap == "clock":
             return jnp.float32(1.0)
         if config.counts == "instances":
@@ -370,7 +378,7 @@ class LayoutEstimator(struct.PyTreeNode):
 
     def _cooccurrence_gap(self, state: LayoutState, goal: jax.Array | int | None) -> jax.Array:
         """Return the gap `learned` or `overdue`, from the pairs seen so far."""
-        config = resolve_estimator(self.config)
+        config = self.resolved_config
         assert state.co_seen is not None
         if self.cooccurrence is None:
             raise ValueError(f"gap={config.gap!r}: needs `cooccurrence`, the evidence that is learned before training")

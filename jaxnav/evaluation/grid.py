@@ -23,7 +23,6 @@ from jaxnav.evaluation.removal import (
     InferenceTrace,
     apply_removal,
     control_logits,
-    counterfactual_logits,
     select_gap,
 )
 from jaxnav.evaluation.replacements import (
@@ -35,10 +34,10 @@ from jaxnav.evaluation.replacements import (
     replace_part,
 )
 from jaxnav.numerics.trees import take_rows, tree_where
-from jaxnav.policies.agent_loop import Agent, AgentLoop, StepResult, policy_memory
+from jaxnav.policies.agent_loop import Agent, AgentLoop, StepResult, decide_counterfactually, policy_memory
 from jaxnav.policies.handover import Decider
 from jaxnav.policies.method import Knowledge
-from jaxnav.policies.network import Params, Policy
+from jaxnav.policies.network import Params
 from jaxnav.scenes.task import MOVE_AHEAD
 
 Tree = TypeVar("Tree")
@@ -405,10 +404,9 @@ def infer_and_act(
         if has_controls:
             removed_logits = control_logits(config, policy, replaced_pathways, replaced_memory, episode_keys, step_keys)
         else:
-            removed_logits = counterfactual_logits(policy, replaced_pathways, replaced_memory)
+            removed_logits = decide_counterfactually(policy, replaced_pathways, replaced_memory).logits
         gap = select_gap(config, gap, running, episode_keys, agent.state.time)
-        has_additive_scores = isinstance(policy, Policy) and policy.has_additive_scores
-        logits, removal_weight = apply_removal(config, decision.logits, removed_logits, gap, has_additive_scores)
+        logits, removal_weight = apply_removal(config, decision.logits, removed_logits, gap, policy.has_additive_scores)
     else:
         removed_logits = decision.logits
         logits = decision.logits

@@ -5,7 +5,7 @@ memory or a memory of its own (`PolicyState.counterfactual_hidden`). The control
 equations: a `HandoverPolicy` whose fallback is the policy under do(Z = 0) keeps the logits of the fallback.
 
 An `InferenceConfig` says how one entry of an evaluation grid turns a decision into logits to act by. At every step
-`counterfactual_logits` decides without the direct pathways, or `control_logits` in a grid with controls. `select_gap`
+`decide_counterfactually` decides without the direct pathways, or `control_logits` in a grid with controls. `select_gap`
 picks the layout gap, and `apply_removal` combines both with the factual logits. Every field of the configuration is a
 traced array, so one compilation serves all entries.
 """
@@ -19,9 +19,10 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxnav.causal import FORMS, do, removal_weight, remove_experience, tde
+from jaxnav.causal import FORMS, removal_weight, remove_experience, tde
 from jaxnav.choices import Form
 from jaxnav.evaluation.replacements import other_running_episode
+from jaxnav.policies.agent_loop import decide_counterfactually
 from jaxnav.policies.handover import Decider
 from jaxnav.policies.pathways import Pathways, PolicyState
 
@@ -73,7 +74,7 @@ class InferenceConfig(struct.PyTreeNode):
       form: int32, index of the form of eq. 2 in `causal.FORMS`.
       use_layout: bool, use the layout's weights; otherwise they are ones.
       greedy: bool, take the best action instead of sampling.
-      act_randomly: bool, ignore the policy.
+      act_randomly: bool, sample the choices of the policy uniformly; with macro-actions these are targets, not actions.
       gap_source: int32, a `GapSource`.
       given_gap: float32, the gap of `GapSource.GIVEN` from step `gap_begin` to before step `gap_end`; 0 at other times.
       gap_begin, gap_end: int32, steps.
@@ -84,7 +85,7 @@ class InferenceConfig(struct.PyTreeNode):
         step.
       replaces_factual: bool, False to replace the part in the counterfactual decision alone.
       max_room_episodes: int32, number of episodes of each room type that the entry runs, the first in the list; the
-        outcomes of the remaining ones are 0.
+        outcomes of the remaining ones are undefined, see `select_first_episodes`.
     """
 
     policy_index: jax.Array
@@ -125,27 +126,6 @@ class InferenceTrace(NamedTuple):
     action_logits: jax.Array
 
 
-def counterfactual_logits(
-    policy: Decider,
-    pathways: Pathways,
-    memory: PolicyState,
-    scene: jax.Array | float = 0.0,
-    goal: jax.Array | float = 0.0,
-) -> jax.Array:
-    """Logits of E decisions under do(S = scene, G = goal), float32 [E, A].
-
-    The counterfactual decision shares experience and previous action with the factual one, and also the recurrent
-    state, unless its branch has a state of its own. Its updated memory is discarded.
-
-    Args:
-      policy: policy with the entry's parameters.
-      pathways, memory: inputs of the factual decisions, leaves [E, ...].
-      scene, goal: values of the direct pathways, numbers or float32 [E, ...].
-    """
-    counterfactual_pathways = do(pathways, scene=scene, goal=goal)
-    return policy.decide(counterfactual_pathways, memory.counterfactual_state()).logits
-
-
 def control_logits(
     config: InferenceConfig,
     policy: Decider,
@@ -157,14 +137,15 @@ def control_logits(
     """Logits to remove from E decisions in a grid with controls, float32 [E, A].
 
     Args:
-      config: configuration of the grid entry; without controls the result is that of `counterfactual_logits`.
+      config: configuration of the grid entry; without controls the result is that of
+        `decide_counterfactually`.
       policy: policy with the entry's parameters.
       pathways, memory: inputs of the factual decisions, leaves [E, ...].
       episode_keys, step_keys: PRNG keys [E] of the episodes and of their current step; folded further.
     """
     scene = _direct_value(config, pathways.scene, step_keys, _SCENE_TAG)
     goal = _direct_value(config, pathways.goal, step_keys, _GOAL_TAG)
-    logits = counterfactual_logits(policy, pathways, memory, scene, goal)
+    logits = decide_counterfactually(policy, pathways, memory, scene, goal).logits
 
     def sample_noise() -> jax.Array:
         noise = _sample_rows(episode_keys, _NOISE_TAG, logits.shape[1:], jax.random.normal)
@@ -228,7 +209,7 @@ def apply_removal(
       logits: float32 [E, A], factual logits.
       removed_logits: float32 [E, A], logits to remove.
       gap: float32 [E], layout gaps.
-      has_additive_scores: whether the logits are the removed ones plus direct scores, without rounding.
+      has_additive_scores: as in `remove_experience`.
 
     Returns:
       Logits float32 [E, A], and the weight float32 [E] of the removed ones.

@@ -155,7 +155,7 @@ def replace_part(
         case ReplacedPart.MEMORY:
             # Experience that reads the memory is computed again.
             partner_memory = take_rows(memory, partner)
-            if not policy.method.reads_memory:
+            if not policy.experience.reads_memory:
                 return pathways, partner_memory
             experience = policy.pathways(inputs, partner_memory).experience
             return pathways._replace(experience=experience), partner_memory

@@ -25,7 +25,7 @@ from jaxnav.experiments.table import Curve, ResultRow
 from jaxnav.experiments.trials import require_estimator_config
 from jaxnav.gaps import CooccurrenceEvidence
 from jaxnav.layout import ESTIMATORS, EstimatorConfig, LayoutEstimator, LayoutState, ViewGeometry
-from jaxnav.policies.agent_loop import Agent, AgentLoop, Perception, decide, policy_memory
+from jaxnav.policies.agent_loop import Agent, AgentLoop, Perception, embed_and_decide, policy_memory
 from jaxnav.policies.method import Knowledge
 from jaxnav.policies.network import Params, Policy
 from jaxnav.runs.policies import Policies, adapt_counts, estimators_by_gap, load_policies
@@ -282,7 +282,7 @@ def _sample_step(
     """
     # Logits from the present view, without any removal.
     inputs = agent_loop.policy_inputs(agent, knowledge, env_params)
-    _, decision = decide(policy, inputs, policy_memory(agent))
+    decision = embed_and_decide(policy, inputs, policy_memory(agent))
 
     # The key of a step depends on the episode's own time only.
     step_keys = jax.vmap(jax.random.fold_in)(episode_keys, agent.state.time)

@@ -24,7 +24,7 @@ from jaxnav.evaluation.statistics import Interval
 from jaxnav.experiments.bench import best_epsilon
 from jaxnav.experiments.config import AgentRun, ExperimentConfig, agent_runs, join_folds
 from jaxnav.experiments.instrument import judge_shift
-from jaxnav.experiments.scores import chooses_actions, list_comparisons
+from jaxnav.experiments.scores import list_comparisons
 from jaxnav.experiments.table import ResultTable, merge_fields
 from jaxnav.experiments.trials import STDE_NAMES
 from jaxnav.scenes.worlds import WORLDS
@@ -139,7 +139,6 @@ def _load_template(template: str) -> jinja2.Template:
         "header": table_header,
         "verdict": verdict,
         "best_epsilon": best_epsilon,
-        "chooses_actions": chooses_actions,
         "list_comparisons": list_comparisons,
         "judge_shift": judge_shift,
         "stde_fields": {name: {"variant": "stde", **options._asdict()} for name, options in STDE_NAMES.items()},

@@ -23,8 +23,6 @@ from jaxnav.evaluation.variants import EvaluationRow, share_networks
 from jaxnav.experiments.bench import Bench, Scores
 from jaxnav.experiments.config import AgentRun
 from jaxnav.experiments.table import ResultRow
-from jaxnav.policies.method import ActionControl
-from jaxnav.policies.methods import find_method
 from jaxnav.runs.evaluate import draw_episode_lists, has_same_episodes, measure_leads
 from jaxnav.runs.run import Run
 
@@ -102,7 +100,7 @@ def difference_rows(
         for variant in TRAINED_VARIANTS:
             if variant in variants:
                 yield _compare_with_chance(run, shift, variants[variant], variants["random"])
-                if not chooses_actions(run):
+                if not run.config.policy_method.chooses_actions:
                     yield from _compare(run, shift, variants[variant], variants["random"], "random", same_runs=True)
 
         for name, reference_scores in references.items():
@@ -151,11 +149,6 @@ def variants_by_name(scores: Scores, decoding: Decoding) -> dict[str, VariantSco
         if row.decoding == decoding or row.variant in UNTRAINED_VARIANTS:
             variants.setdefault(row.variant, VariantScores(row, metrics, scores.episodes))
     return variants
-
-
-def chooses_actions(run: AgentRun) -> bool:
-    """True if the choices of a run's policies are the actions themselves, so that random choices are random actions."""
-    return find_method(run.config.method).control == ActionControl()
 
 
 def _compare(

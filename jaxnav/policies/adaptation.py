@@ -200,7 +200,7 @@ class LearnedLossAdaptation:
         self, policy: Policy, window: Window, layer_changes: dict[str, LowRankChange]
     ) -> dict[str, LowRankChange]:
         """Return the changes of one inner step, [..., W, ...] for each layer."""
-        learned_loss = cast(HasLearnedLoss, policy.method).learned_loss
+        learned_loss = cast(HasLearnedLoss, policy.experience).learned_loss
         # First order: stop gradients of training everywhere but in the loss, which nothing else would train.
         if not self.second_order:
             graph, params = nnx.split(policy)

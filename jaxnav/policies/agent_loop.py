@@ -1,14 +1,14 @@
 """The agent loop: perceive, decide, act, for every episode in training, evaluation and replays.
 
 `Perception` turns the views of one episode into beliefs that need no trained parameters: the layout belief, the spatial
-map and the state of the method's tracker. `policy_inputs` joins them with the observation, and `decide` runs a policy
-on these inputs. `AgentLoop` ties both to an environment: it starts B parallel episodes, and steps them with or without
-auto-reset.
+map and the state of the method's tracker. `policy_inputs` joins them with the observation, and `embed_and_decide` runs
+a policy on these inputs. `AgentLoop` ties both to an environment: it starts B parallel episodes, and steps them with or
+without auto-reset.
 
     loop = AgentLoop(env, spec, estimator_config)
     agent = loop.start(start_key, num_envs, policy.initial_memory((num_envs,)), knowledge, env_params)
     inputs = loop.policy_inputs(agent, knowledge, env_params)
-    _, decision = decide(policy, inputs, policy_memory(agent))
+    decision = embed_and_decide(policy, inputs, policy_memory(agent))
     choice = jax.random.categorical(choice_key, decision.logits)
     agent, result = loop.step(agent, choice, knowledge, env_params, policy=policy, decision=decision, reset_keys=keys)
 """
@@ -19,8 +19,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxnav.causal import do
 from jaxnav.env.objectnav import EnvParams, ObjectNav, Observation, State
-from jaxnav.layout import EstimatorConfig, LayoutEstimator, LayoutState, ViewGeometry, resolve_estimator
+from jaxnav.layout import EstimatorConfig, LayoutEstimator, LayoutState, ViewGeometry
 from jaxnav.numerics.trees import tree_where
 from jaxnav.policies.adaptation import limit_inner_steps
 from jaxnav.policies.handover import Decider, HandoverPolicy
@@ -96,7 +97,7 @@ class Perception:
         # Layout belief: equations 3 to 5.
         layout_estimator = self._layout_estimator(knowledge, room)
         if layout_estimator is not None and layout is not None:
-            counts_instances = resolve_estimator(layout_estimator.config).counts == "instances"
+            counts_instances = layout_estimator.resolved_config.counts == "instances"
             read_counts = self.row_format.counts if counts_instances else self.row_format.presence
             geometry = None
             if self._uses_geometry:
@@ -163,7 +164,7 @@ class Perception:
     @property
     def _uses_geometry(self) -> bool:
         """True where the layout gap reads the positions of detections."""
-        return self.estimator_config is not None and resolve_estimator(self.estimator_config).gap == "surprise"
+        return self.estimator_config is not None and self.estimator_config.gap == "surprise"
 
     @property
     def tracker(self) -> Any:
@@ -183,9 +184,9 @@ class Perception:
         return LayoutEstimator(knowledge.layout[room], self.estimator_config, cooccurrence)
 
 
-def decide(
+def embed_and_decide(
     policy: Decider, inputs: PolicyInputs, memory: PolicyState, use_direct: jax.Array | None = None
-) -> tuple[Pathways, Decision]:
+) -> Decision:
     """Run a policy: embed the pathways, then decide on them.
 
     Args:
@@ -194,13 +195,30 @@ def decide(
       memory: the policy's state, batch [...].
       use_direct: bool [...], False where both direct pathways are set to zero (training with `counterfactual: coin`);
         None keeps them.
-
-    Returns:
-      The pathways after masking, for interventions, and the decision on them.
     """
     pathways = policy.pathways(inputs, memory)
     pathways = mask_direct_pathways(pathways, use_direct)
-    return pathways, policy.decide(pathways, memory)
+    return policy.decide(pathways, memory)
+
+
+def decide_counterfactually(
+    policy: Decider,
+    pathways: Pathways,
+    memory: PolicyState,
+    scene: jax.Array | float = 0.0,
+    goal: jax.Array | float = 0.0,
+) -> Decision:
+    """Decide under do(S = scene, G = goal).
+
+    The decision shares experience and previous action with the factual one, and also the recurrent state, unless the
+    counterfactual branch has a state of its own.
+
+    Args:
+      policy: policy with bound parameters.
+      pathways, memory: inputs of the factual decisions, leaves [...].
+      scene, goal: values of the direct pathways, numbers or float32 [...].
+    """
+    return policy.decide(do(pathways, scene=scene, goal=goal), memory.counterfactual_state())
 
 
 class Agent(NamedTuple):

@@ -4,7 +4,7 @@ Handover to a layout-blind policy uses this class, and so does the controlled di
 policy itself under do(Z = 0).
 """
 
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import jax.numpy as jnp
 
@@ -31,6 +31,8 @@ class HandoverPolicy:
         memory.
       is_same_network: True if the fallback is `experienced` under do(Z = 0).
     """
+
+    has_additive_scores: ClassVar[bool] = False
 
     def __init__(self, experienced: Policy, layout_blind: Policy | None = None) -> None:
         """Pair two policies.

@@ -37,7 +37,7 @@ class Knowledge(NamedTuple):
     Attributes:
       layout: float32 [rooms, K, K], the layout prior alpha* of each room type.
       method: nested dict of arrays, the result of the method's `learn`; empty if it learns nothing.
-      cooccurrence: evidence about the layout, leaves [rooms, K, K]; None where no gap needs it.
+      cooccurrence: evidence about the layout, leaves [rooms, K, K]; None for runs without the arm `layout`.
     """
 
     layout: jax.Array
@@ -331,8 +331,13 @@ class Method:
     name: str = ""
 
     @property
+    def chooses_actions(self) -> bool:
+        """True if the choices of the policies are the actions themselves, Done among them."""
+        return isinstance(self.control, ActionControl)
+
+    @property
     def has_additive_scores(self) -> bool:
-        """True if the scores of the policies are a sum: direct scores plus experience."""
+        """True if the scores of the policies are a sum of direct scores and experience."""
         return self.policy_class is not None and self.policy_class.has_additive_scores
 
     def __post_init__(self) -> None:

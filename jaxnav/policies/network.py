@@ -28,6 +28,7 @@ from jaxnav.numerics.product import Linear, add_bias, matmul_rows
 from jaxnav.numerics.recurrence import gru_step
 from jaxnav.numerics.rounding import round_to_grid
 from jaxnav.policies.features import CONFIDENCE_INDEX, CategoryMaps, Features, scale_geometry, unpack_features
+from jaxnav.policies.method import Experience
 from jaxnav.policies.pathways import NO_ACTION, Decision, Pathways, PolicyInputs, PolicyState, mask_experience
 from jaxnav.policies.spatial_memory import SpatialMemory
 from jaxnav.policies.spec import PolicySpec, Sizes
@@ -118,7 +119,7 @@ class Stream(nnx.Module):
         # Small initial logits: a new policy is close to uniform except for Done.
         small_kernel = nnx.initializers.variance_scaling(1e-4, "fan_in", "normal")
         initial_logits = np.zeros(num_choices, np.float32)
-        if num_choices == NUM_ACTIONS:
+        if spec.method.chooses_actions:
             initial_logits[DONE] = done_logit
         self.actor = Linear(
             self.hidden,
@@ -135,8 +136,8 @@ class Stream(nnx.Module):
         Args:
           pathways: leaves [..., ...].
           action: int32 [...], the previous action.
-          changes: changes of the layers. The change of `fuse` depends on scene and goal too; it is added here, because
-            one place must add it.
+          changes: changes of the layers. The change of `fuse` depends on scene and goal, too; it is added once, here,
+            and not in `direct_input`.
         """
         # The kernel of `fuse` is a sum over its inputs, so the direct ones can be added separately.
         *_, experience_kernel, action_kernel = self.fuse_kernels
@@ -214,7 +215,8 @@ class Policy(Stream):
     """Three pathways, fused before one recurrent core; works on single observations and batches."""
 
     num_views: ClassVar[int] = 1  # the scene layer embeds the view once per stream
-    #: True if logits are direct scores plus experience, so that the counterfactual logits are the experience itself.
+    #: True if logits are log probabilities of detection, an exact sum of direct scores and experience; see
+    #: `jaxnav.causal.remove_experience`.
     has_additive_scores: ClassVar[bool] = False
 
     def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:
@@ -238,13 +240,17 @@ class Policy(Stream):
         self.appearance = nnx.Embed(perceived_spec.num_categories, sizes.appearance, rngs=rngs)
         self.view = Linear(num_scene_inputs, self.num_views * sizes.view_outputs, rngs=rngs)
 
-        # Goal G: detections and the category of the goal. Experience Z: the method's own module; `self.method` is this
-        # `Experience` (the attribute is a checkpoint path), the local `method` is the `Method`.
+        # Goal G: detections and the category of the goal. Experience Z: the method's own module, see `experience`.
         self.detections = CategoryMaps.for_detections(perceived_spec, rngs)
         self.sought = nnx.Embed(perceived_spec.num_categories, sizes.appearance, rngs=rngs)
         self.method = method.experience(perceived_spec, rngs)
 
         super().__init__(self._input_widths(sizes), method.control.num_choices, spec, rngs)
+
+    @property
+    def experience(self) -> Experience:
+        """The experience module of the method; its parameters are stored as `method`."""
+        return self.method
 
     def pathways(
         self, inputs: PolicyInputs, memory: PolicyState | None = None, partner_inputs: PolicyInputs | None = None
@@ -266,7 +272,7 @@ class Policy(Stream):
         """
         # Only `attend` reads the memory; everything before it runs in parallel over time.
         encoded = self.encode(inputs, partner_inputs)
-        if not self.method.reads_memory:
+        if not self.experience.reads_memory:
             return encoded
         if memory is None:
             raise ValueError("pathways: the experience of the method reads the memory; pass `memory`")
@@ -281,8 +287,8 @@ class Policy(Stream):
         if inputs.surroundings is not None:
             map_inputs = SpatialMemory.encode_surroundings(inputs.surroundings)
             scene_inputs = jnp.concatenate([scene_inputs, map_inputs], axis=-1)
-        if self.method.num_scene_inputs:
-            scene_inputs = jnp.concatenate([scene_inputs, self.method.scene_inputs(inputs.reading)], axis=-1)
+        if self.experience.num_scene_inputs:
+            scene_inputs = jnp.concatenate([scene_inputs, self.experience.scene_inputs(inputs.reading)], axis=-1)
         scene = nnx.relu(self.view(scene_inputs))
 
         # G: the detections that `direct` selects, and the goal.
@@ -294,12 +300,12 @@ class Policy(Stream):
             layout_weights = scale_weights(layout_weights, inputs.observation.goal)
         experience_features, reading = features, inputs.reading
         if partner_inputs is not None:
-            experience_features, reading = self.method.replace_other_categories(
+            experience_features, reading = self.experience.replace_other_categories(
                 features, inputs.reading, self._unpack(partner_inputs), partner_inputs.reading
             )
         if self.weight_kind == "pixel":
             experience_features = scale_geometry(experience_features)
-        experience = self.method.encode(experience_features, self.experience_appearance, layout_weights, reading)
+        experience = self.experience.encode(experience_features, self.experience_appearance, layout_weights, reading)
 
         # The Done gate follows the confidence of the goal's detection.
         confidence = (features.table[..., CONFIDENCE_INDEX] * features.goal).sum(axis=-1, keepdims=True)
@@ -308,7 +314,7 @@ class Policy(Stream):
 
     def attend(self, encoded: Pathways, memory: PolicyState) -> Pathways:
         """Compute the experience from the encoded inputs and the memory."""
-        return encoded._replace(experience=self.method.attend(encoded.experience, memory))
+        return encoded._replace(experience=self.experience.attend(encoded.experience, memory))
 
     def decide(self, pathways: Pathways, memory: PolicyState) -> Decision:
         """Return action logits and value.
@@ -374,16 +380,11 @@ class Policy(Stream):
         """Embeddings of the categories that experience reads, float32 [K, d]."""
         return self.appearance.embedding[...]
 
-    @property
-    def pathway_widths(self) -> tuple[int, ...]:
-        """Widths of scene, goal, experience and gate."""
-        return *self.widths[:3], 1
-
     def _input_widths(self, sizes: Sizes) -> tuple[int, ...]:
         """Widths of scene, goal, experience and previous action."""
         # Maps of the categories, the row of the goal where it is used, and the embedding of the goal.
         goal_width = self.detections.width + sizes.row_outputs * self.goal_row + sizes.appearance
-        return sizes.view_outputs, goal_width, self.method.width, NUM_ACTIONS
+        return sizes.view_outputs, goal_width, self.experience.width, NUM_ACTIONS
 
     def _num_perceived_categories(self) -> int:
         """Number of categories that the networks see, after the method's `perceive`."""
@@ -441,7 +442,7 @@ class StreamsPolicy(Policy):
     def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:
         super().__init__(spec, rngs)
         # The experience stream reads experience, a view embedding, the factor 1 and the previous action.
-        experience_widths = self.method.width + spec.sizes.view_outputs + 1, NUM_ACTIONS
+        experience_widths = self.experience.width + spec.sizes.view_outputs + 1, NUM_ACTIONS
         num_choices = self.actor.out_features
         self.experience_stream = Stream(experience_widths, num_choices, spec, rngs, done_logit=0.0)
         # Category embeddings of the experience stream, which shares none with the direct stream.
@@ -455,16 +456,16 @@ class StreamsPolicy(Policy):
         # The experience stays a pair until `_join_experience`: `attend`, if needed, computes only its first part.
         experience_parts = (encoded.experience, append_one(experience_view))
         encoded = encoded._replace(scene=append_one(direct_view), experience=experience_parts)
-        return encoded if self.method.reads_memory else _join_experience(encoded)
+        return encoded if self.experience.reads_memory else _join_experience(encoded)
 
     def attend(self, encoded: Pathways, memory: PolicyState) -> Pathways:
         """Compute the experience from the encoded inputs and the memory of its stream."""
-        if not self.method.reads_memory:
+        if not self.experience.reads_memory:
             return encoded
         experience, experience_view = encoded.experience
         # The second half of the hidden state belongs to the stream of experience.
         stream_memory = memory._replace(hidden=memory.hidden[..., self.hidden :])
-        attended = self.method.attend(experience, stream_memory)
+        attended = self.experience.attend(experience, stream_memory)
         return _join_experience(encoded._replace(experience=(attended, experience_view)))
 
     def direct_input(self, pathways: Pathways) -> jax.Array:
@@ -529,11 +530,6 @@ class StreamsPolicy(Policy):
         experience_gates = _split_gates(self.experience_stream.recurrent_kernel)
         blocks = map(jax.scipy.linalg.block_diag, direct_gates, experience_gates)
         return jnp.concatenate(list(blocks), axis=-1)
-
-    @property
-    def pathway_widths(self) -> tuple[int, ...]:
-        """Widths of scene, goal, experience and gate."""
-        return *self.widths[:2], self.experience_stream.widths[0], 1
 
     def _input_widths(self, sizes: Sizes) -> tuple[int, ...]:
         """Widths of the direct stream's inputs."""

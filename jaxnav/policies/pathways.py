@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxnav.causal import do
 from jaxnav.env.objectnav import Observation
 from jaxnav.scenes.task import NUM_ACTIONS
 
@@ -29,7 +28,8 @@ class PolicyInputs(NamedTuple):
       layout_weights: float32 [..., K], the layout's weights for the goal, its column of w (eq. 7); ones disable the
         layout.
       reading: output of the method's tracker, a pytree; None without a tracker.
-      surroundings: uint8 [..., M], known cells around the agent; None without a spatial memory.
+      surroundings: uint8 [..., M], states of the map cells around the agent (unknown, blocked, free or visited); None
+        without a spatial memory.
     """
 
     observation: Observation
@@ -121,7 +121,7 @@ def mask_experience(pathways: Pathways, use_experience: jax.Array | None) -> Pat
     """
     if use_experience is None:
         return pathways
-    return do(pathways, experience=use_experience[..., None] * pathways.experience)
+    return pathways._replace(experience=use_experience[..., None] * pathways.experience)
 
 
 def mask_direct_pathways(pathways: Pathways, use_direct: jax.Array | None) -> Pathways:
@@ -135,4 +135,4 @@ def mask_direct_pathways(pathways: Pathways, use_direct: jax.Array | None) -> Pa
         return pathways
     masked_scene = jnp.where(use_direct[..., None], pathways.scene, 0.0)
     masked_goal = jnp.where(use_direct[..., None], pathways.goal, 0.0)
-    return do(pathways, scene=masked_scene, goal=masked_goal)
+    return pathways._replace(scene=masked_scene, goal=masked_goal)

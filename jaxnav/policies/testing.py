@@ -16,7 +16,7 @@ from jaxnav.causal import do
 from jaxnav.env.make import build_environment
 from jaxnav.env.objectnav import NUM_PRIORS, EnvParams, ObjectNav
 from jaxnav.layout import ESTIMATORS, prior_from_counts
-from jaxnav.policies.agent_loop import Agent, AgentLoop, PolicyInputs, decide, policy_memory
+from jaxnav.policies.agent_loop import Agent, AgentLoop, PolicyInputs, embed_and_decide, policy_memory
 from jaxnav.policies.method import Knowledge, Method, Percept
 from jaxnav.policies.methods import find_method
 from jaxnav.policies.network import Params, init_params
@@ -87,7 +87,8 @@ def check_method(
     @jax.jit
     def act_once(agent: Agent, step_key: jax.Array) -> tuple[Agent, jax.Array]:
         policy = agent_loop.bind(params)
-        _, decision = decide(policy, agent_loop.policy_inputs(agent, knowledge, env_params), policy_memory(agent))
+        inputs = agent_loop.policy_inputs(agent, knowledge, env_params)
+        decision = embed_and_decide(policy, inputs, policy_memory(agent))
         # Sample the choices, and step all episodes without a reset.
         choice = jax.random.categorical(step_key, decision.logits)
         next_agent, _ = agent_loop.step(agent, choice, knowledge, env_params, policy=policy, decision=decision)

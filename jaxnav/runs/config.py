@@ -14,7 +14,7 @@ from jaxnav.choices import CounterfactualMemory, Counts, Reduction, WorldName
 from jaxnav.errors import InputError
 from jaxnav.policies.spec import DecisionKind, Direct, PolicySpec, Sizes, WeightKind
 from jaxnav.scenes.tables.observation_row import Detector
-from jaxnav.scenes.task import NUM_ACTIONS, FrontCell, Task
+from jaxnav.scenes.task import FrontCell, Task
 from jaxnav.scenes.worlds import WORLDS
 from jaxnav.store.files import expand_home
 from jaxnav.training.config import CounterfactualTraining, PPOConfig, stage_index_at
@@ -495,7 +495,7 @@ def usual_direct(method: "Method") -> Direct:
 
 def _usual_guidance(config: RunConfig, method: "Method") -> float:
     """Weight of guidance by default: that of the world, and 0 for methods that do not choose actions."""
-    return WORLDS[config.world].guidance if method.control.num_choices == NUM_ACTIONS else 0.0
+    return WORLDS[config.world].guidance if method.chooses_actions else 0.0
 
 
 def _check_method(config: RunConfig, method: "Method") -> None:
@@ -512,12 +512,12 @@ def _check_method(config: RunConfig, method: "Method") -> None:
         _require(config.decision == "fused", "decision", config.decision, advice)
 
     # The gate multiplies the logit of Done, which exists only where the method chooses actions.
-    can_gate = not config.done_gate or method.control.num_choices == NUM_ACTIONS
+    can_gate = not config.done_gate or method.chooses_actions
     advice = f"method {config.method!r} does not choose actions, so there is no Done to gate; omit the option"
     _require(can_gate, "done_gate", True, advice)
 
     # Guidance compares the choices with the actions of shortest paths.
-    can_guide = not config.ppo.has_guidance or method.control.num_choices == NUM_ACTIONS
+    can_guide = not config.ppo.has_guidance or method.chooses_actions
     advice = f"method {config.method!r} does not choose actions, so shortest paths cannot guide it; omit the option"
     _require(can_guide, "ppo.guidance", config.ppo.guidance, advice)
 

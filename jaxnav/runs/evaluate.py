@@ -421,7 +421,7 @@ def _add_fallback_rows(
       all_rows: rows in the order of the table, without the oracle.
       rows: rows that were run, with the oracle at the end.
       outcome: outcomes of `rows`, leaves [R, S, E].
-      policies, world, num_episodes, seed: as in `evaluate_rows`.
+      policies, compiled_world, num_episodes, seed: as in `evaluate_rows`.
 
     Returns:
       All rows in order, their outcomes, and the number of further compilations.
@@ -778,15 +778,13 @@ def measure_leads(results: Results, reference: Results) -> list[ExperienceLead]:
 def _check_comparable(results: Results, reference: Results) -> None:
     """Refuse results of other episodes or numbers of seeds, or a reference without a baseline."""
     if not has_same_episodes(results.episodes, reference.episodes):
-        raise InputError("account: the two runs have different episodes; train both in one world with equal rules")
+        raise InputError("reference run: has other episodes than the run; train both in one world with equal rules")
     num_seeds = results.outcome.length.shape[1]
     reference_seeds = reference.outcome.length.shape[1]
     if num_seeds != reference_seeds:
-        raise InputError(
-            f"account: the run has {num_seeds} seeds, but the reference run has {reference_seeds}; train equally many"
-        )
+        raise InputError(f"reference run: has {reference_seeds} seeds, but the run has {num_seeds}; train equally many")
     if EvaluationRow("baseline", None, None, "argmax") not in reference.rows:
-        raise InputError("account: the reference run has no arm `baseline`; train it with --arms baseline")
+        raise InputError("reference run: has no arm `baseline`; train it with --arms baseline")
 
 
 def has_same_episodes(episodes: EpisodeList, other: EpisodeList) -> bool:
@@ -814,7 +812,7 @@ def replay_episodes(
     if row.uses_own_fallback:
         policies = policies.with_own_fallback()
 
-    # The first cell of the grid is the row with the first seed.
+    # The first entry of the grid is the row with the first seed.
     inference = jax.tree.map(lambda leaf: leaf[0], inference_grid([row], policies.arms, policies.num_seeds))
     params = jax.tree.map(lambda leaf: leaf[inference.policy_index], policies.params)
     return play_episodes(

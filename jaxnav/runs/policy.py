@@ -17,12 +17,12 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxnav import __version__
-from jaxnav.causal import FORMS, do, remove_experience
+from jaxnav.causal import FORMS, remove_experience
 from jaxnav.choices import EstimatorName, Form
 from jaxnav.env.objectnav import OTHER_ROOM, ObjectNav, Observation, prior_index
 from jaxnav.errors import InputError, check_choice
 from jaxnav.layout import EstimatorConfig
-from jaxnav.policies.agent_loop import Perception, PerceptionState, decide
+from jaxnav.policies.agent_loop import Perception, PerceptionState, decide_counterfactually
 from jaxnav.policies.method import Knowledge, Percept
 from jaxnav.policies.network import Params, bind
 from jaxnav.policies.pathways import Decision, PolicyState
@@ -185,15 +185,15 @@ class LoadedPolicy(struct.PyTreeNode):
 
         # Factual decision.
         policy = bind(self.spec, self.params)
-        pathways, decision = decide(policy, inputs, memory.policy_state)
+        pathways = policy.pathways(inputs, memory.policy_state)
+        decision = policy.decide(pathways, memory.policy_state)
         factual = decision.logits
         layout = perception_state.layout
         if layout is None or self.estimator_config is None:
             return PolicyOutput(factual, factual, None, None, None, perception_state, decision)
 
         # Counterfactual decision under do(S = 0, G = 0) with the factual experience, and its removal.
-        counterfactual_state = memory.policy_state.counterfactual_state()
-        counterfactual = policy.decide(do(pathways, scene=0.0, goal=0.0), counterfactual_state).logits
+        counterfactual = decide_counterfactually(policy, pathways, memory.policy_state).logits
         logits = remove_experience(
             factual,
             counterfactual,

@@ -296,7 +296,7 @@ def warn_if_rollout_too_short(config: RunConfig, console: PlainConsole) -> None:
 
 
 def warn_if_more_steps(config: RunConfig, console: PlainConsole) -> None:
-    """Say so if whole chunks make the run clearly longer than its `total_steps`."""
+    """Warn if whole chunks make the run more than 5 % longer than its `total_steps`."""
     asked_steps = config.total_steps
     num_steps = config.total_updates * config.steps_per_update
     if asked_steps is not None and num_steps > (1 + _NOTED_EXCESS) * asked_steps:
@@ -324,7 +324,8 @@ def prepare_training(
     if has_preparation(config.run_dir):
         preparation = load_preparation(config.run_dir, manifest)
         if preparation is not None:
-            run_on_first_process(lambda: None)  # processes that learn wait for the one that stores
+            # Join the barrier of `save_preparation` below: another process may find what this one has just stored.
+            run_on_first_process(lambda: None)
             console.print(f"layout prior of this run, from {int(preparation.exploration.steps):,} random steps")
             return preparation
         console.print(f"{config.run_dir / PREPARATION_DIR}: is damaged, so it is learned again")
@@ -361,7 +362,7 @@ def explore_world(config: RunConfig, compiled_world: CompiledWorld) -> Explorati
 
     # Explore bank by bank, and add up the counts.
     estimator_config = named_estimator(config)
-    explore_bank = jax.jit(explore, static_argnums=(0, 3, 4, 5))
+    explore_bank = jax.jit(explore, static_argnames=("env", "num_walks", "num_steps", "estimator_config"))
     explorations = []
     for bank_index, params in enumerate(prefetch_env_params(compiled_world, range(num_banks))):
         bank_key = jax.random.fold_in(key, bank_index)
@@ -397,7 +398,8 @@ def calibrate_estimator(
     """
     estimator_config = named_estimator(config)
     if config.policy_method.has_additive_scores:
-        estimator_config = dataclasses.replace(estimator_config, form="paper")  # removes from a sum
+        # The default `residual` would rescale the direct scores.
+        estimator_config = dataclasses.replace(estimator_config, form="paper")
     if estimator_config.strength is None:
         return estimator_config  # `paper` and `released` keep the sums of the counts, so nothing is calibrated
 
@@ -445,14 +447,14 @@ def learn_knowledge(
     num_categories = exploration.counts.shape[-1]
     num_walks = limit_walks(_EVIDENCE_WALK_FACTOR * config.layout.walks, 1, num_categories)
     is_pooled = config.layout.prior == "pooled"
-    learn_evidence = jax.jit(fit_shift_classifier, static_argnums=(0, 4, 5))
+    learn_evidence = jax.jit(fit_shift_classifier, static_argnames=("env", "num_walks", "pooled"))
     env_params = compiled_world.make_env_params(0)
     cooccurrence = learn_evidence(compiled_world.env, env_params, exploration.counts, key, num_walks, is_pooled)
 
     # Log odds of the distances at which pairs were seen.
     near_key = jax.random.fold_in(jax.random.key(config.seed), _SIGHTINGS)
     num_walks = limit_walks(_SIGHTING_WALK_FACTOR * config.layout.walks, NUM_NEAR_FEATURES, num_categories)
-    learn_near_evidence = jax.jit(fit_sighting_classifier, static_argnums=(0, 4, 5))
+    learn_near_evidence = jax.jit(fit_sighting_classifier, static_argnames=("env", "num_walks", "pooled"))
     near_log_odds = learn_near_evidence(
         compiled_world.env, env_params, exploration.counts, near_key, num_walks, is_pooled
     )

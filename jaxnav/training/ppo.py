@@ -46,7 +46,7 @@ from jaxnav.causal import do
 from jaxnav.env.objectnav import EnvParams, Observation
 from jaxnav.numerics.recurrence import UnrolledGRU, gru_step, unroll_gru
 from jaxnav.numerics.trees import tree_where
-from jaxnav.policies.agent_loop import Agent, AgentLoop, decide, policy_memory
+from jaxnav.policies.agent_loop import Agent, AgentLoop, decide_counterfactually, embed_and_decide, policy_memory
 from jaxnav.policies.method import Knowledge, Method, Stage
 from jaxnav.policies.methods.imitation import expert_actions, imitation_loss
 from jaxnav.policies.network import Params, Policy, init_params
@@ -254,7 +254,7 @@ def collect_rollout(
         # Decide and sample.
         use_direct = jax.random.bernoulli(direct_key, 0.5, (num_envs,)) if use_coin else None
         inputs = agent_loop.policy_inputs(agent, knowledge, env_params)
-        _, decision = decide(policy, inputs, policy_memory(agent), use_direct)
+        decision = embed_and_decide(policy, inputs, policy_memory(agent), use_direct)
         choice = jax.random.categorical(action_key, decision.logits)
         log_probs = jax.nn.log_softmax(decision.logits)
         log_prob = jnp.take_along_axis(log_probs, choice[:, None], axis=-1)[:, 0]
@@ -304,7 +304,8 @@ def collect_rollout(
     # Bootstrap values: of truncated agents, once their last view is perceived, and of the agents after the rollout.
     # Environments without a truncation compute a value that is not used (their step is -1).
     def estimate_value(agent: Agent) -> jax.Array:
-        _, decision = decide(policy, agent_loop.policy_inputs(agent, knowledge, env_params), policy_memory(agent))
+        inputs = agent_loop.policy_inputs(agent, knowledge, env_params)
+        decision = embed_and_decide(policy, inputs, policy_memory(agent))
         return decision.value
 
     truncated_action = policy_memory(truncated_agents.agent).action
@@ -479,7 +480,7 @@ def _replay_in_parallel(
     direct_input = policy.direct_input(pathways)
 
     # Factual: unroll the GRU through time. `policy.decide` is not called here, so the experience is masked by hand.
-    if policy.method.reads_memory:
+    if policy.experience.reads_memory:
         unrolled_core = _unroll_with_attention(
             policy, pathways, direct_input, previous_action, transitions, memory.hidden
         )
@@ -564,12 +565,12 @@ def _replay_step_by_step(
         # `policy.decide` masks the experience by the flag of the memory, drawn in the rollout.
         memory = memory._replace(use_experience=transition.use_experience)
         factual_pathways = mask_direct_pathways(policy.attend(encoded, memory), transition.use_direct)
-        factual_decision = policy.decide(factual_pathways, memory)
+        # The counterfactual branch is advanced below, with gradients of its own.
+        factual_decision = policy.decide(factual_pathways, memory._replace(counterfactual_hidden=None))
 
         # No gradient of the counterfactual branch enters the factual memory, but a state of its own has gradients.
         fixed_memory = jax.lax.stop_gradient(memory)._replace(counterfactual_hidden=memory.counterfactual_hidden)
-        counterfactual_pathways = do(policy.attend(encoded, fixed_memory), scene=0.0, goal=0.0)
-        counterfactual_decision = policy.decide(counterfactual_pathways, fixed_memory.counterfactual_state())
+        counterfactual_decision = decide_counterfactually(policy, policy.attend(encoded, fixed_memory), fixed_memory)
 
         # New episodes start from fresh memory.
         next_memory = factual_decision.next_state(transition.action)

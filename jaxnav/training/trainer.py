@@ -94,16 +94,16 @@ class Trainer:
 
     def abstract_states(self, env_params: EnvParams) -> SeedStates:
         """Shapes, dtypes and shardings of all states in a checkpoint."""
-        # Functions that are not jitted, because JAX traces no options of the compiler.
+        # `jax.eval_shape` cannot trace functions that are jitted with `compiler_options`.
         init_functions = {arm: self._stage_learner(arm, 0).init for arm in self.learners}
         return jax.eval_shape(functools.partial(self._init_seeds, init_functions), env_params)
 
     def pack(self, seed_states: SeedStates) -> TrainerStates:
-        """Convert states from those in a checkpoint."""
+        """Turn the states of a checkpoint into those that the trainer holds."""
         return seed_states
 
     def unpack(self, states: TrainerStates) -> SeedStates:
-        """Convert states to those in a checkpoint."""
+        """Turn states that the trainer holds into those of a checkpoint."""
         return states
 
     def init(self, env_params: EnvParams) -> TrainerStates:
@@ -260,7 +260,7 @@ class Trainer:
         def train(state: LearnerState, scalars: PPOScalars, env_params: EnvParams, knowledge: Knowledge) -> Any:
             return learner.train(state, scalars, env_params, knowledge, self._chunk_size)
 
-        # Shapes say nothing of how the arrays came about, so a resumed run finds the compiled program in the cache.
+        # Lower from shapes: restored arrays would give another cache key, so that a resumed run compiles again.
         shapes = jax.eval_shape(lambda *arrays: arrays, *arguments)
         # With JAX_DISABLE_JIT all loops would be unrolled into one enormous program.
         with jax.disable_jit(False):

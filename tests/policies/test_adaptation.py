@@ -139,7 +139,7 @@ def window_loss(spec, window, method_weights, fast_layers):
         direct_hidden = hidden[: policy.hidden]
         probs = jax.nn.softmax(policy.action_logits(direct_hidden, pathways.gate))
         rows.append(jnp.concatenate([direct_hidden, probs]))
-    return cast(HasLearnedLoss, policy.method).learned_loss(jnp.stack(rows))
+    return cast(HasLearnedLoss, policy.experience).learned_loss(jnp.stack(rows))
 
 
 # The rule

@@ -51,7 +51,7 @@ class CompiledPolicy:
         method_sizes = SPEC.method_sizes if method_name == "org" else ()
         spec = dataclasses.replace(SPEC, method=find_method(method_name), method_sizes=method_sizes)
         policy = bind(spec, random_params(0, spec))
-        self.experience_width = policy.method.width
+        self.experience_width = policy.experience.width
         self.pathways = jax.jit(lambda *inputs: policy.pathways(PolicyInputs(*inputs)))
         self.decide = jax.jit(lambda pathways, memory: policy.decide(pathways, memory))
         self.initial_memory = policy.initial_memory

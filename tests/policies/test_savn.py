@@ -115,7 +115,7 @@ def losses_around_inner_steps(policy_params: Any, num_steps: int) -> tuple[jax.A
     def window_loss(fast_weights):
         no_changes = zero_output_changes(fast_weights.layer_changes)
         rows, _ = replay_window(policy, fast_weights.window, fast_weights.layer_changes, no_changes)
-        return policy.method.learned_loss(rows)  # type: ignore[attr-defined]
+        return policy.experience.learned_loss(rows)  # type: ignore[attr-defined]
 
     def act(agent, key):
         memory = policy_memory(agent)

@@ -49,10 +49,10 @@ def test_account_of_a_run_over_itself_is_zero(evaluated):
 @pytest.mark.slow
 def test_account_refuses_runs_that_differ(evaluated):
     one_seed_results = evaluated._replace(outcome=type(evaluated.outcome)(*(leaf[:, :1] for leaf in evaluated.outcome)))
-    with pytest.raises(InputError, match="the run has 2 seeds, but the reference run has 1"):
+    with pytest.raises(InputError, match="has 1 seeds, but the run has 2"):
         measure_leads(evaluated, one_seed_results)
     reversed_goals = evaluated.episodes._replace(goal=evaluated.episodes.goal[::-1])
-    with pytest.raises(InputError, match="have different episodes"):
+    with pytest.raises(InputError, match="has other episodes than the run"):
         measure_leads(evaluated, evaluated._replace(episodes=reversed_goals))
     layout_rows = evaluated._replace(rows=[row for row in evaluated.rows if row.variant != "baseline"])
     with pytest.raises(InputError, match="no arm `baseline`"):

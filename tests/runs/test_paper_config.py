@@ -175,9 +175,9 @@ def test_weights_multiply_the_rows_of_experience_unscaled():
     weights = jax.random.uniform(jax.random.key(1), (NUM_CATEGORIES,), maxval=0.2).at[goal].set(1.0)
     pathways = policy.encode(PolicyInputs(Observation(row, goal), weights))
     features = unpack_features(row, goal, world.perception.row_format)
-    expected = policy.method.encode(features, policy.experience_appearance, weights, None)
+    expected = policy.experience.encode(features, policy.experience_appearance, weights, None)
     np.testing.assert_array_equal(pathways.experience, expected)
-    doubled = policy.method.encode(features, policy.experience_appearance, 2 * weights, None)
+    doubled = policy.experience.encode(features, policy.experience_appearance, 2 * weights, None)
     assert np.abs(doubled - expected).max() > 1e-3
 
 

@@ -27,9 +27,8 @@ BATCH_SIZE = 16
 
 def random_pathways(policy, rng, num_steps=NUM_STEPS):
     """Random embeddings, leaves [T, B, ...]."""
-    widths = policy.pathway_widths
-    scene, goal, experience, _ = (
-        jnp.asarray(rng.normal(size=(num_steps, BATCH_SIZE, width)), jnp.float32) for width in widths
+    scene, goal, experience = (
+        jnp.asarray(rng.normal(size=(num_steps, BATCH_SIZE, width)), jnp.float32) for width in policy.widths[:3]
     )
     return Pathways(scene, goal, experience, jnp.ones((num_steps, BATCH_SIZE, 1)))
 

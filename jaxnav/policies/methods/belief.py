@@ -314,10 +314,10 @@ class TargetPolicy(Policy):
           goal: int32 [], the category that is sought.
           weights: float32 [K], the goal's column of w (eq. 7).
         """
-        assert isinstance(self.method, Predictor)
+        assert isinstance(self.experience, Predictor)
         missed = missed_looks(squares.looks, self.detection_rates[...][goal], self.hidden_logit[...])
         places = self.places(squares) + missed
-        return LogBeliefs(places, places + self.method.score_squares(squares, goal, weights))
+        return LogBeliefs(places, places + self.experience.score_squares(squares, goal, weights))
 
     def goal_probabilities(
         self, squares: MapSquares, goal: jax.Array, weights: jax.Array, removal_weight: jax.Array | float = 0.0
@@ -342,7 +342,7 @@ class TargetPolicy(Policy):
         reading: Any = inputs.reading
         if partner_inputs is not None:
             features = self._unpack_goal(inputs)
-            _, reading = self.method.replace_other_categories(features, reading, features, partner_inputs.reading)
+            _, reading = self.experience.replace_other_categories(features, reading, features, partner_inputs.reading)
 
         # Only episodes in which a target is due are computed.
         rows: Any = (reading, goal, inputs.layout_weights)

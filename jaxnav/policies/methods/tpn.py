@@ -265,8 +265,8 @@ class TentativeAdaptation:
 
     def decide(self, policy: "Policy", pathways: "Pathways", memory: "PolicyState") -> "Decision":
         """Decide with the changed actor, then adapt it where the pose is repeated."""
-        assert isinstance(policy.method, TentativeRelations)
-        tentative = policy.method.tentative
+        assert isinstance(policy.experience, TentativeRelations)
+        tentative = policy.experience.tentative
         trials, num_decisions, actor_change, _ = memory.fast
 
         # Decide, with a reset actor every `reset_interval` decisions.

@@ -201,7 +201,7 @@ def experience_imitation_loss(replay: Any, *_: Any) -> tuple[jax.Array, dict[str
       replay: a `jaxnav.training.ppo.Replay`.
     """
     # With streams the view follows the experience of the method.
-    transformer = replay.policy.method
+    transformer = replay.policy.experience
     experience = replay.pathways.experience[..., : transformer.width]
     return imitation_loss(transformer.expert(experience), expert_actions(replay))
 
