@@ -29,7 +29,15 @@ from jaxnav.numerics.recurrence import gru_step
 from jaxnav.numerics.rounding import round_to_grid
 from jaxnav.policies.features import CONFIDENCE_INDEX, CategoryMaps, Features, scale_geometry, unpack_features
 from jaxnav.policies.method import Experience
-from jaxnav.policies.pathways import NO_ACTION, Decision, Pathways, PolicyInputs, PolicyState, mask_experience
+from jaxnav.policies.pathways import (
+    NO_ACTION,
+    Decision,
+    EncodedPathways,
+    Pathways,
+    PolicyInputs,
+    PolicyState,
+    mask_experience,
+)
 from jaxnav.policies.spatial_memory import SpatialMemory
 from jaxnav.policies.spec import PolicySpec, Sizes
 from jaxnav.scenes.tables.observation_row import RowFormat
@@ -270,16 +278,10 @@ class Policy(Stream):
         Raises:
           ValueError: the experience reads the memory, and none is given.
         """
-        # Only `attend` reads the memory; everything before it runs in parallel over time.
-        encoded = self.encode(inputs, partner_inputs)
-        if not self.experience.reads_memory:
-            return encoded
-        if memory is None:
-            raise ValueError("pathways: the experience of the method reads the memory; pass `memory`")
-        return self.attend(encoded, memory)
+        return self.attend(self.encode(inputs, partner_inputs), memory)
 
-    def encode(self, inputs: PolicyInputs, partner_inputs: PolicyInputs | None = None) -> Pathways:
-        """Embed without memory, in parallel over time; the result needs `attend` if the experience reads the memory."""
+    def encode(self, inputs: PolicyInputs, partner_inputs: PolicyInputs | None = None) -> EncodedPathways:
+        """Embed all that needs no memory, in parallel over time."""
         features = self._unpack(inputs)
 
         # S: everything about the scene that does not depend on objects.
@@ -310,11 +312,26 @@ class Policy(Stream):
         # The Done gate follows the confidence of the goal's detection.
         confidence = (features.table[..., CONFIDENCE_INDEX] * features.goal).sum(axis=-1, keepdims=True)
         gate = DONE_GATE * confidence if self.done_gate else jnp.ones_like(confidence)
-        return Pathways(scene=scene, goal=goal_embedding, experience=experience, gate=gate, reading=inputs.reading)
+        return EncodedPathways(
+            scene=scene, goal=goal_embedding, experience=experience, gate=gate, reading=inputs.reading
+        )
 
-    def attend(self, encoded: Pathways, memory: PolicyState) -> Pathways:
-        """Compute the experience from the encoded inputs and the memory."""
-        return encoded._replace(experience=self.experience.attend(encoded.experience, memory))
+    def attend(self, encoded: EncodedPathways, memory: PolicyState | None) -> Pathways:
+        """Complete the pathways by experience that reads the memory.
+
+        Args:
+          encoded: result of `encode`, leaves [...].
+          memory: leaves [...]; None unless the method's experience reads the memory.
+
+        Raises:
+          ValueError: the experience reads the memory, and none is given.
+        """
+        experience = encoded.experience
+        if self.experience.reads_memory:
+            if memory is None:
+                raise ValueError("pathways: the experience of the method reads the memory; pass `memory`")
+            experience = self.experience.attend(experience, memory)
+        return Pathways(encoded.scene, encoded.goal, experience, encoded.gate, encoded.reading)
 
     def decide(self, pathways: Pathways, memory: PolicyState) -> Decision:
         """Return action logits and value.
@@ -360,7 +377,7 @@ class Policy(Stream):
         counterfactual_pathways = do(pathways, scene=0.0, goal=0.0)
         return self._decide_with_adaptation(counterfactual_pathways, memory.counterfactual_state()).hidden
 
-    def direct_input(self, pathways: Pathways) -> jax.Array:
+    def direct_input(self, pathways: Pathways | EncodedPathways) -> jax.Array:
         """Project both direct pathways, float32 [..., H]; linear, so zero where both are zero."""
         scene_kernel, goal_kernel, *_ = self.fuse_kernels
         return matmul_rows(pathways.scene, scene_kernel) + matmul_rows(pathways.goal, goal_kernel)
@@ -448,27 +465,22 @@ class StreamsPolicy(Policy):
         # Category embeddings of the experience stream, which shares none with the direct stream.
         self.known_appearance = nnx.Embed(self.appearance.num_embeddings, spec.sizes.appearance, rngs=rngs)
 
-    def encode(self, inputs: PolicyInputs, partner_inputs: PolicyInputs | None = None) -> Pathways:
-        """Embed without memory, in parallel over time; the result needs `attend` if the experience reads the memory."""
+    def encode(self, inputs: PolicyInputs, partner_inputs: PolicyInputs | None = None) -> EncodedPathways:
+        """Embed all that needs no memory, in parallel over time."""
         encoded = super().encode(inputs, partner_inputs)
         # The view layer embeds the view twice, once per stream; the appended 1 is the factor of the stream.
         direct_view, experience_view = jnp.split(encoded.scene, 2, axis=-1)
-        # The experience stays a pair until `_join_experience`: `attend`, if needed, computes only its first part.
-        experience_parts = (encoded.experience, append_one(experience_view))
-        encoded = encoded._replace(scene=append_one(direct_view), experience=experience_parts)
-        return encoded if self.experience.reads_memory else _join_experience(encoded)
+        return encoded._replace(scene=append_one(direct_view), view=append_one(experience_view))
 
-    def attend(self, encoded: Pathways, memory: PolicyState) -> Pathways:
-        """Compute the experience from the encoded inputs and the memory of its stream."""
-        if not self.experience.reads_memory:
-            return encoded
-        experience, experience_view = encoded.experience
+    def attend(self, encoded: EncodedPathways, memory: PolicyState | None) -> Pathways:
+        """Complete the pathways: experience, from the memory of its stream, then the view of this stream."""
         # The second half of the hidden state belongs to the stream of experience.
-        stream_memory = memory._replace(hidden=memory.hidden[..., self.hidden :])
-        attended = self.experience.attend(experience, stream_memory)
-        return _join_experience(encoded._replace(experience=(attended, experience_view)))
+        stream_memory = None if memory is None else memory._replace(hidden=memory.hidden[..., self.hidden :])
+        pathways = super().attend(encoded, stream_memory)
+        assert encoded.view is not None  # `encode` embeds the view for both streams
+        return pathways._replace(experience=jnp.concatenate([pathways.experience, encoded.view], axis=-1))
 
-    def direct_input(self, pathways: Pathways) -> jax.Array:
+    def direct_input(self, pathways: Pathways | EncodedPathways) -> jax.Array:
         """Project both direct pathways, float32 [..., 2 H]; zero for the stream of experience."""
         direct = super().direct_input(pathways)
         return jnp.concatenate([direct, jnp.zeros_like(direct)], axis=-1)
@@ -544,11 +556,6 @@ def _stop_gradient_where(decision: Decision, condition: jax.Array) -> Decision:
         logits=jnp.where(condition, fixed.logits, decision.logits),
         value=jnp.where(condition[..., 0], fixed.value, decision.value),
     )
-
-
-def _join_experience(encoded: Pathways) -> Pathways:
-    """Concatenate the method's experience and the view of its stream."""
-    return encoded._replace(experience=jnp.concatenate(encoded.experience, axis=-1))
 
 
 def _interleave_gates(direct: jax.Array, experience: jax.Array) -> jax.Array:

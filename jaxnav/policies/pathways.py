@@ -8,7 +8,7 @@
 `PolicyState` what it carries from step to step.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -58,6 +58,24 @@ class Pathways(NamedTuple):
     experience: jax.Array
     gate: jax.Array
     reading: Any = None
+
+
+class EncodedPathways(NamedTuple):
+    """What `Policy.encode` computes without the memory; `Policy.attend` makes it `Pathways`.
+
+    Attributes:
+      scene, goal, gate, reading: as in `Pathways`.
+      experience: output of the method's `Experience.encode`: float32 [..., Z], or a pytree of the method's own if its
+        experience reads the memory.
+      view: float32 [..., V + 1], the embedding of the view for the experience stream, and a 1; None without streams.
+    """
+
+    scene: jax.Array
+    goal: jax.Array
+    experience: Any
+    gate: jax.Array
+    reading: Any = None
+    view: jax.Array | None = None
 
 
 class PolicyState(NamedTuple):
@@ -112,6 +130,9 @@ class Decision(NamedTuple):
         return PolicyState(self.hidden, action, self.fast, self.use_experience, self.counterfactual_hidden)
 
 
+PathwaysT = TypeVar("PathwaysT", Pathways, EncodedPathways)
+
+
 def mask_experience(pathways: Pathways, use_experience: jax.Array | None) -> Pathways:
     """Set the experience to zero where `use_experience` is 0.
 
@@ -124,7 +145,7 @@ def mask_experience(pathways: Pathways, use_experience: jax.Array | None) -> Pat
     return pathways._replace(experience=use_experience[..., None] * pathways.experience)
 
 
-def mask_direct_pathways(pathways: Pathways, use_direct: jax.Array | None) -> Pathways:
+def mask_direct_pathways(pathways: PathwaysT, use_direct: jax.Array | None) -> PathwaysT:
     """Set both direct pathways to zero where `use_direct` is False.
 
     Args:

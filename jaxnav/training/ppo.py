@@ -53,7 +53,7 @@ from jaxnav.policies.network import Params, Policy, init_params
 from jaxnav.policies.pathways import (
     NO_ACTION,
     Decision,
-    Pathways,
+    EncodedPathways,
     PolicyInputs,
     PolicyState,
     mask_direct_pathways,
@@ -415,7 +415,7 @@ class Replay(NamedTuple):
     Attributes:
       policy: policy bound to the parameters under differentiation.
       transitions: the rollout's transitions.
-      pathways: output of `policy.encode`, before masking and before the experience attends to the memory.
+      encoded: output of `policy.encode`, before masking and before the experience attends to the memory.
       factual: decisions as in the rollout.
       counterfactual: decisions with both direct pathways zero, and the same experience. The recurrent state is that of
         the factual decisions, which no gradient enters, or a state of its own.
@@ -424,7 +424,7 @@ class Replay(NamedTuple):
 
     policy: Policy
     transitions: Transition
-    pathways: Pathways
+    encoded: EncodedPathways
     factual: Decision
     counterfactual: Decision
     env_params: EnvParams
@@ -447,16 +447,16 @@ def replay_rollout(policy: Policy, transitions: Transition, memory: PolicyState,
         reading=transitions.reading,
         surroundings=transitions.surroundings,
     )
-    pathways = policy.encode(inputs)
+    encoded = policy.encode(inputs)
 
     # An adaptation changes the layers within the rollout, so the whole policy is scanned over time. Otherwise all that
     # does not depend on the memory runs in parallel over time.
     replay_decisions = _replay_in_parallel if policy.adaptation is None else _replay_step_by_step
-    factual_decision, counterfactual_decision = replay_decisions(policy, pathways, transitions, memory)
+    factual_decision, counterfactual_decision = replay_decisions(policy, encoded, transitions, memory)
     return Replay(
         policy=policy,
         transitions=transitions,
-        pathways=pathways,
+        encoded=encoded,
         factual=factual_decision,
         counterfactual=counterfactual_decision,
         env_params=env_params,
@@ -464,7 +464,7 @@ def replay_rollout(policy: Policy, transitions: Transition, memory: PolicyState,
 
 
 def _replay_in_parallel(
-    policy: Policy, pathways: Pathways, transitions: Transition, memory: PolicyState
+    policy: Policy, encoded: EncodedPathways, transitions: Transition, memory: PolicyState
 ) -> tuple[Decision, Decision]:
     """Apply inputs and heads for all T steps in parallel; the GRU, and experience that reads its state, step by step.
 
@@ -476,20 +476,20 @@ def _replay_in_parallel(
     previous_action = jnp.concatenate([memory.action[None], next_previous_action[:-1]])
 
     # Mask the direct pathways as while acting; experience does not read them.
-    pathways = mask_direct_pathways(pathways, transitions.use_direct)
-    direct_input = policy.direct_input(pathways)
+    encoded = mask_direct_pathways(encoded, transitions.use_direct)
+    direct_input = policy.direct_input(encoded)
 
     # Factual: unroll the GRU through time. `policy.decide` is not called here, so the experience is masked by hand.
     if policy.experience.reads_memory:
         unrolled_core = _unroll_with_attention(
-            policy, pathways, direct_input, previous_action, transitions, memory.hidden
+            policy, encoded, direct_input, previous_action, transitions, memory.hidden
         )
         # Experience of all steps at once, from constant memories: for the counterfactual branch and the heads.
         memory_before = PolicyState(hidden=unrolled_core.hidden_before, action=previous_action)
-        pathways = mask_experience(policy.attend(pathways, memory_before), transitions.use_experience)
+        pathways = mask_experience(policy.attend(encoded, memory_before), transitions.use_experience)
         mediated_input = policy.mediated_input(pathways, previous_action)
     else:
-        pathways = mask_experience(pathways, transitions.use_experience)
+        pathways = mask_experience(policy.attend(encoded, None), transitions.use_experience)
         mediated_input = policy.mediated_input(pathways, previous_action)
         factual_gates = policy.input_gates(direct_input + mediated_input)
         unrolled_core = unroll_gru(policy.recurrent_kernel, factual_gates, transitions.ended, memory.hidden)
@@ -512,7 +512,7 @@ def _replay_in_parallel(
 
 def _unroll_with_attention(
     policy: Policy,
-    pathways: Pathways,
+    encoded: EncodedPathways,
     direct_input: jax.Array,
     previous_action: jax.Array,
     transitions: Transition,
@@ -522,7 +522,7 @@ def _unroll_with_attention(
 
     Args:
       policy: policy whose method reads the memory.
-      pathways: outputs of `policy.encode`, leaves [T, B, ...].
+      encoded: outputs of `policy.encode`, leaves [T, B, ...].
       direct_input: float32 [T, B, H], the projected direct pathways; [T, B, 2 H] with two streams, as all states.
       previous_action: int32 [T, B].
       transitions: leaves [T, B, ...].
@@ -533,10 +533,10 @@ def _unroll_with_attention(
     """
 
     def step(hidden_before: jax.Array, inputs: Any) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        encoded, direct, action, use_experience, ended = inputs
+        step_encoded, direct, action, use_experience, ended = inputs
         # The experience attends from the state before the step, then the GRU advances.
         memory_before = PolicyState(hidden=hidden_before, action=action)
-        attended = mask_experience(policy.attend(encoded, memory_before), use_experience)
+        attended = mask_experience(policy.attend(step_encoded, memory_before), use_experience)
         input_gates = policy.input_gates(direct + policy.mediated_input(attended, action))
         hidden_after = gru_step(input_gates, policy.hidden_gates(hidden_before), hidden_before)
 
@@ -544,14 +544,14 @@ def _unroll_with_attention(
         next_hidden = jnp.where(ended[:, None], 0.0, hidden_after)
         return next_hidden, (hidden_after, hidden_before)
 
-    scan_inputs = pathways, direct_input, previous_action, transitions.use_experience, transitions.ended
+    scan_inputs = encoded, direct_input, previous_action, transitions.use_experience, transitions.ended
     _, (hidden_after, hidden_before) = jax.lax.scan(step, hidden, scan_inputs)
     hidden_before = jax.lax.stop_gradient(hidden_before)
     return UnrolledGRU(hidden_after, hidden_before, policy.hidden_gates(hidden_before))
 
 
 def _replay_step_by_step(
-    policy: Policy, pathways: Pathways, transitions: Transition, memory: PolicyState
+    policy: Policy, encoded: EncodedPathways, transitions: Transition, memory: PolicyState
 ) -> tuple[Decision, Decision]:
     """Scan the whole policy over time, for policies that adapt within an episode.
 
@@ -560,17 +560,19 @@ def _replay_step_by_step(
     """
     fresh_memory = policy.initial_memory(memory.action.shape)
 
-    def replay_step(memory: PolicyState, inputs: tuple[Pathways, Transition]) -> tuple[PolicyState, Any]:
-        encoded, transition = inputs
+    def replay_step(memory: PolicyState, inputs: tuple[EncodedPathways, Transition]) -> tuple[PolicyState, Any]:
+        step_encoded, transition = inputs
         # `policy.decide` masks the experience by the flag of the memory, drawn in the rollout.
         memory = memory._replace(use_experience=transition.use_experience)
-        factual_pathways = mask_direct_pathways(policy.attend(encoded, memory), transition.use_direct)
+        factual_pathways = mask_direct_pathways(policy.attend(step_encoded, memory), transition.use_direct)
         # The counterfactual branch is advanced below, with gradients of its own.
         factual_decision = policy.decide(factual_pathways, memory._replace(counterfactual_hidden=None))
 
         # No gradient of the counterfactual branch enters the factual memory, but a state of its own has gradients.
         fixed_memory = jax.lax.stop_gradient(memory)._replace(counterfactual_hidden=memory.counterfactual_hidden)
-        counterfactual_decision = decide_counterfactually(policy, policy.attend(encoded, fixed_memory), fixed_memory)
+        counterfactual_decision = decide_counterfactually(
+            policy, policy.attend(step_encoded, fixed_memory), fixed_memory
+        )
 
         # New episodes start from fresh memory.
         next_memory = factual_decision.next_state(transition.action)
@@ -579,7 +581,7 @@ def _replay_step_by_step(
         next_memory = tree_where(transition.ended, fresh_memory, next_memory)
         return next_memory, (factual_decision, counterfactual_decision)
 
-    _, decisions = jax.lax.scan(replay_step, memory, (pathways, transitions))
+    _, decisions = jax.lax.scan(replay_step, memory, (encoded, transitions))
     return decisions
 
 

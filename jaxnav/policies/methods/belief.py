@@ -65,7 +65,7 @@ from jaxnav.policies.methods.map_tracker import (
 )
 from jaxnav.policies.methods.semexp import learn_search_setup, required_map_sizes
 from jaxnav.policies.network import Policy
-from jaxnav.policies.pathways import NO_ACTION, Decision, Pathways, PolicyInputs, PolicyState
+from jaxnav.policies.pathways import NO_ACTION, Decision, EncodedPathways, Pathways, PolicyInputs, PolicyState
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.tables.compile import Bank
 from jaxnav.scenes.tables.observation_row import RowFormat
@@ -334,10 +334,8 @@ class TargetPolicy(Policy):
         remaining = remove_from_sum(beliefs.places, beliefs.layout - beliefs.places, gap, 0.0)
         return jax.nn.softmax(remaining, axis=(0, 1))
 
-    def pathways(
-        self, inputs: PolicyInputs, memory: PolicyState | None = None, partner_inputs: PolicyInputs | None = None
-    ) -> Pathways:
-        """Score the targets; arguments as in `Policy.pathways`."""
+    def encode(self, inputs: PolicyInputs, partner_inputs: PolicyInputs | None = None) -> EncodedPathways:
+        """Score the targets, which needs no memory; arguments as in `Policy.pathways`."""
         goal = inputs.observation.goal
         reading: Any = inputs.reading
         if partner_inputs is not None:
@@ -352,11 +350,7 @@ class TargetPolicy(Policy):
         if goal.ndim == 0:
             direct, experience = direct[0], experience[0]
         ones = jnp.ones_like(direct[..., :1])
-        return Pathways(scene=direct, goal=direct[..., :0], experience=experience, gate=ones)
-
-    def encode(self, inputs: PolicyInputs, partner_inputs: PolicyInputs | None = None) -> Pathways:
-        """Score the targets, which needs no memory."""
-        return self.pathways(inputs, None, partner_inputs)
+        return EncodedPathways(scene=direct, goal=direct[..., :0], experience=experience, gate=ones)
 
     def decide(self, pathways: Pathways, memory: PolicyState) -> Decision:
         """Add direct scores and experience."""

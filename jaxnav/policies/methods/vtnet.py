@@ -200,10 +200,8 @@ def experience_imitation_loss(replay: Any, *_: Any) -> tuple[jax.Array, dict[str
     Args:
       replay: a `jaxnav.training.ppo.Replay`.
     """
-    # With streams the view follows the experience of the method.
-    transformer = replay.policy.experience
-    experience = replay.pathways.experience[..., : transformer.width]
-    return imitation_loss(transformer.expert(experience), expert_actions(replay))
+    expert_head = replay.policy.experience.expert
+    return imitation_loss(expert_head(replay.encoded.experience), expert_actions(replay))
 
 
 _IMITATION = Stage(
