@@ -25,9 +25,13 @@ Variant = Literal["oracle", "frontier", "random", "agent", "baseline", "layout",
 PlayedVariant = Literal["stde", "scde", "layout", "baseline"]
 #: Parts of a decision whose cost an evaluation measures: other categories in Z, all parts, or none.
 Costs = Literal["categories", "all", "none"]
+DEFAULT_COSTS: Costs = "categories"
 #: Causal quantity that a complete removal of experience leaves: the total direct effect (eq. 1), or the decision under
 #: do(Z = 0) (controlled direct effect).
 Removal = Literal["tde", "cde"]
+DEFAULT_REMOVALS: tuple[Removal, ...] = ("tde",)
+#: Thresholds of soft removal in an evaluation.
+DEFAULT_EPSILONS = (0.5,)
 #: Memory of the counterfactual branch: the factual one, or one of its own, to which both direct pathways are zero.
 CounterfactualMemory = Literal["factual", "own"]
 #: Categories that exchange their places under a layout shift: neighbours in size, drawn for each scene, or the ones

@@ -10,7 +10,19 @@ from typing import Any, Literal
 
 from rich.console import Console
 
-from jaxnav.choices import Costs, CounterfactualMemory, EstimatorName, Form, Removal, ShiftKind, Split, WorldName
+from jaxnav.choices import (
+    DEFAULT_COSTS,
+    DEFAULT_EPSILONS,
+    DEFAULT_REMOVALS,
+    Costs,
+    CounterfactualMemory,
+    EstimatorName,
+    Form,
+    Removal,
+    ShiftKind,
+    Split,
+    WorldName,
+)
 from jaxnav.cli.console import (
     make_result_console,
     name_evaluation,
@@ -90,14 +102,14 @@ class EvalConfig:
     shift: float | None = None
     shift_by: ShiftKind = "size"
     episodes: int = 1000
-    epsilon: tuple[float, ...] = (0.5,)
+    epsilon: tuple[float, ...] = DEFAULT_EPSILONS
     form: tuple[Form, ...] | None = None
     setting: EstimatorName | None = None
     hold: bool = False
     inner_steps: int | None = None
-    removal: tuple[Removal, ...] = ("tde",)
+    removal: tuple[Removal, ...] = DEFAULT_REMOVALS
     counterfactual_memory: CounterfactualMemory | None = None
-    costs: Costs = "categories"
+    costs: Costs = DEFAULT_COSTS
     seed: int = 0
     benchmark: str | None = None
     tracks: tuple[str, ...] = ()

@@ -30,7 +30,7 @@ from jaxnav.env.spaces import Box, Dict, Discrete
 from jaxnav.errors import InputError
 from jaxnav.numerics.trees import tree_where
 from jaxnav.scenes.categories import ROOM_TYPES
-from jaxnav.scenes.tables.observation_row import AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE, RowFormat
+from jaxnav.scenes.tables.observation_row import AHEAD_SCALE, RIGHT_ORIGIN, RIGHT_SCALE, SIZE_SCALE, RowFormat
 from jaxnav.scenes.task import DONE, LOOK_DOWN, LOOK_UP, MOVE_AHEAD, NUM_ACTIONS, ROTATE_LEFT, ROTATE_RIGHT, Task
 
 #: Index of the layout prior that all room types outside `ROOM_TYPES` share; read by agents, not by the environment.
@@ -39,7 +39,7 @@ OTHER_ROOM = len(ROOM_TYPES)
 NUM_PRIORS = OTHER_ROOM + 1
 #: A detection is (byte - origin) / scale: confidence, metres ahead, metres to the right, apparent size.
 DETECTION_SCALE = np.array([255.0, AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE], np.float32)
-DETECTION_ORIGIN = np.array([0.0, 0.0, 128.0, 0.0], np.float32)
+DETECTION_ORIGIN = np.array([0.0, 0.0, RIGHT_ORIGIN, 0.0], np.float32)
 #: An episode that starts near its goal takes the nearest to the goal of this many random cells.
 NUM_START_CANDIDATES = 8
 

@@ -14,6 +14,7 @@ from jaxnav.numerics.product import Linear, add_bias, matmul_rows
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.tables.observation_row import (
     AHEAD_SCALE,
+    RIGHT_ORIGIN,
     RIGHT_SCALE,
     SIZE_SCALE,
     VIEW_BLOCKED,
@@ -72,7 +73,7 @@ def unpack_features(row: jax.Array, goal: jax.Array, row_format: RowFormat) -> F
     confidence, ahead_byte, right_byte, size_byte = jnp.moveaxis(detections, -1, 0)
     visible = (confidence > 0).astype(jnp.float32)
     ahead = ahead_byte / (AHEAD_SCALE * _OFFSET_SCALE)
-    right = (right_byte - 128.0) / (RIGHT_SCALE * _OFFSET_SCALE)
+    right = (right_byte - RIGHT_ORIGIN) / (RIGHT_SCALE * _OFFSET_SCALE)
     distance = jnp.sqrt(ahead**2 + right**2)
     inverse_distance = 1.0 / jnp.maximum(distance, _MIN_DISTANCE)
 

@@ -14,7 +14,7 @@ from rich.console import Console
 from jaxnav.errors import InputError
 from jaxnav.runs.config import MAX_SEEDS, RunConfig, check_config
 from jaxnav.runs.run import Run
-from jaxnav.runs.train import TrainCallback, check_config_and_method, train_points
+from jaxnav.runs.train import TrainCallback, check_config_and_method, train_runs
 from jaxnav.training.devices import exit_if_process_lost
 
 #: Settings of `RunConfig.ppo` that may differ between the runs of a batch.
@@ -62,18 +62,18 @@ def train_batch(
     config = check_config_and_method(config)
     if config.policy_method.fit is not None:
         raise InputError(f"method {config.method!r}: is fitted without PPO; train its runs one after the other")
-    points = list_points(config, settings)
-    num_policies = config.seeds * len(points)
+    run_configs = list_run_configs(config, settings)
+    num_policies = config.seeds * len(run_configs)
     if num_policies > MAX_SEEDS:
-        raise InputError(f"{len(points)} runs x {config.seeds} seeds: give at most {MAX_SEEDS:,} policies in all")
+        raise InputError(f"{len(run_configs)} runs x {config.seeds} seeds: give at most {MAX_SEEDS:,} policies in all")
 
     # The program is compiled for the terms of the loss that the runs have, which the shared settings may lack.
-    shared_config = dataclasses.replace(points[0], run_dir=config.run_dir, seeds=num_policies)
-    train_points(shared_config, points, console, callback)
-    return [Run(point) for point in points]
+    shared_config = dataclasses.replace(run_configs[0], run_dir=config.run_dir, seeds=num_policies)
+    train_runs(shared_config, run_configs, console, callback)
+    return [Run(run_config) for run_config in run_configs]
 
 
-def list_points(config: RunConfig, settings: Mapping[str, Any]) -> list[RunConfig]:
+def list_run_configs(config: RunConfig, settings: Mapping[str, Any]) -> list[RunConfig]:
     """List the configurations of the runs of a batch; see `train_batch`."""
     if not settings:
         raise InputError(f"no settings; give one or more of {', '.join(BATCH_SETTINGS)}, with a number for each run")
@@ -91,23 +91,23 @@ def list_points(config: RunConfig, settings: Mapping[str, Any]) -> list[RunConfi
     if len(set(num_values.values())) > 1:
         raise InputError(f"settings have different numbers of values ({num_values}); give one of each for every run")
 
-    points = []
+    run_configs = []
     for index, point_values in enumerate(zip(*columns.values(), strict=True)):
         changes = {name: float(value) for name, value in zip(columns, point_values, strict=True)}
         ppo = dataclasses.replace(config.ppo, **changes)
-        points.append(check_config(dataclasses.replace(config, run_dir=config.run_dir / str(index), ppo=ppo)))
-    _check_programs(points)
-    return points
+        run_configs.append(check_config(dataclasses.replace(config, run_dir=config.run_dir / str(index), ppo=ppo)))
+    _check_programs(run_configs)
+    return run_configs
 
 
-def _check_programs(points: Sequence[RunConfig]) -> None:
+def _check_programs(run_configs: Sequence[RunConfig]) -> None:
     """Refuse runs that need different programs: the terms of the loss are fixed when it is compiled."""
-    if len({point.ppo.has_guidance for point in points}) > 1:
+    if len({run_config.ppo.has_guidance for run_config in run_configs}) > 1:
         raise InputError(
             "guidance: some runs have guidance (guidance or final_guidance above 0) and some have none, which needs "
             "two programs; train them in two batches"
         )
-    if len({point.ppo.experience_prob < 1.0 for point in points}) > 1:
+    if len({run_config.ppo.experience_prob < 1.0 for run_config in run_configs}) > 1:
         raise InputError(
             "experience: some runs have experience in all episodes (1) and some do not, which needs two programs; "
             "train them in two batches"

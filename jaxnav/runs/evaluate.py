@@ -17,7 +17,18 @@ from rich.console import Console
 from rich.table import Table
 
 from jaxnav.baselines.shortest_path import run_oracle
-from jaxnav.choices import Costs, CounterfactualMemory, Decoding, EstimatorName, Form, Removal, ShiftKind
+from jaxnav.choices import (
+    DEFAULT_COSTS,
+    DEFAULT_EPSILONS,
+    DEFAULT_REMOVALS,
+    Costs,
+    CounterfactualMemory,
+    Decoding,
+    EstimatorName,
+    Form,
+    Removal,
+    ShiftKind,
+)
 from jaxnav.errors import InputError, check_choice
 from jaxnav.evaluation.episodes import EpisodeList, join_episode_lists
 from jaxnav.evaluation.grid import EpisodeOutcome, Evaluator, episode_metrics, start_states
@@ -90,14 +101,14 @@ def evaluate(
     shift: float | None = None,
     shift_by: ShiftKind = "size",
     episodes: int = 1000,
-    epsilon: float | Sequence[float] | np.ndarray = (0.5,),
+    epsilon: float | Sequence[float] | np.ndarray = DEFAULT_EPSILONS,
     form: Form | Sequence[Form] | None = None,
     setting: EstimatorName | None = None,
     hold: bool = False,
-    removal: Removal | Sequence[Removal] = ("tde",),
+    removal: Removal | Sequence[Removal] = DEFAULT_REMOVALS,
     counterfactual_memory: CounterfactualMemory | None = None,
     inner_steps: int | None = None,
-    costs: Costs = "categories",
+    costs: Costs = DEFAULT_COSTS,
     seed: int = 0,
     compiled: CompiledWorld | None = None,
     console: Console | None = None,
@@ -152,14 +163,14 @@ def evaluate(
     found_subject = find_subject(subject)
     if isinstance(found_subject, AgentSubject):
         policy_options = {
-            "epsilon": epsilons != [0.5],
+            "epsilon": tuple(epsilons) != DEFAULT_EPSILONS,
             "form": form is not None,
             "setting": setting is not None,
             "hold": hold,
-            "removal": removals != ("tde",),
+            "removal": removals != DEFAULT_REMOVALS,
             "counterfactual_memory": counterfactual_memory is not None,
             "inner_steps": inner_steps is not None,
-            "costs": costs != "categories",
+            "costs": costs != DEFAULT_COSTS,
         }
         _refuse_policy_options(found_subject.name, policy_options)
         return evaluate_agents(

@@ -12,7 +12,7 @@ from jaxnav.runs.policies import POLICIES_DIR
 from jaxnav.runs.policy import MODEL_CARD_SIGNATURE, LoadedPolicy, export_program, format_model_card, load_policy
 from jaxnav.runs.run import Run
 from jaxnav.scenes.categories import ROOM_TYPES
-from jaxnav.scenes.tables.observation_row import AHEAD_SCALE, RIGHT_SCALE, SIZE_SCALE
+from jaxnav.scenes.tables.observation_row import AHEAD_SCALE, RIGHT_ORIGIN, RIGHT_SCALE, SIZE_SCALE
 from jaxnav.scenes.task import ACTIONS
 from jaxnav.store.export import PARAMS_FILE, POLICY_FILE
 from jaxnav.store.files import write_atomic
@@ -162,7 +162,7 @@ _INPUTS_TEXT = f"""
 Inputs, a row for each episode:
 
 * `detections` uint8 [K, 4]: for each category, by the nearest object of it, confidence x 255 (0: not detected), metres
-  ahead x {AHEAD_SCALE:g}, metres to the right x {RIGHT_SCALE:g} + 128, apparent size x {SIZE_SCALE:g}
+  ahead x {AHEAD_SCALE:g}, metres to the right x {RIGHT_SCALE:g} + {RIGHT_ORIGIN:g}, apparent size x {SIZE_SCALE:g}
 * `view` uint8 [V, V]: cells of 0.25 m before the agent, 0 unknown, 1 free, 2 blocked; row 0 is nearest, column 0
   leftmost; the middle of row 1 is {{front_cell}}
 * `goal`, `action`, `heading`, `horizon`, `room` int32: category of the goal, previous action, compass heading, horizon

@@ -1,6 +1,6 @@
 """Training of a run, from the layout prior to the exported policies.
 
-`train` is the entry point, and `batch.train_batch` that of several runs side by side; both call `train_points`. Before
+`train` is the entry point, and `batch.train_batch` that of several runs side by side; both call `train_runs`. Before
 training, `explore_world`, `calibrate_estimator` and `learn_knowledge` collect the layout prior and everything else that
 is known from the training scenes; `prepare_training` stores the results in the run directory. `make_trainer` builds the
 trainer of all seeds of both arms (`baseline`: policies without the layout estimator, `layout`: with it), and
@@ -149,19 +149,19 @@ def train(config: RunConfig, console: Console | None = None, callback: TrainCall
       Interrupted: Ctrl-C or SIGTERM came during training. The run is saved, and the same call resumes it.
     """
     config = check_config_and_method(config)
-    train_points(config, [config], console, callback)
+    train_runs(config, [config], console, callback)
     return Run(config)
 
 
-def train_points(
-    config: RunConfig, points: Sequence[RunConfig], console: Console | None, callback: TrainCallback | None
+def train_runs(
+    config: RunConfig, run_configs: Sequence[RunConfig], console: Console | None, callback: TrainCallback | None
 ) -> None:
     """Train runs side by side that differ in traced settings of PPO alone, and export the policies of each.
 
     Args:
       config: checked configuration that all share, with the directory of the training state; its seeds are those of
-        all points. A single run is its own point.
-      points: checked configurations of the runs.
+        all runs. Of a single run it is the configuration itself.
+      run_configs: checked configurations of the runs.
       console, callback: see `train`.
     """
     require_float32()
@@ -173,19 +173,19 @@ def train_points(
     check_agreement(json.dumps(make_manifest(run_settings(config))))
     compiled_world = compile_training_world(config, console)
     manifest_fields = {"scenes_fingerprint": compiled_world.fingerprint, "budget": config.steps_by_purpose}
-    if list(points) != [config]:
-        ppo_settings = [run_settings(point)["ppo"] for point in points]
+    if list(run_configs) != [config]:
+        ppo_settings = [run_settings(run_config)["ppo"] for run_config in run_configs]
         manifest_fields["points"] = {name: [settings[name] for settings in ppo_settings] for name in ppo_settings[0]}
     manifest = make_manifest(manifest_settings(config) | manifest_fields)
     check_agreement(json.dumps(manifest))
 
     with lock_run_dir(config) as lock:
-        _train_in_run_dir(config, points, compiled_world, manifest, mesh, lock, stopwatch, console, callback)
+        _train_in_run_dir(config, run_configs, compiled_world, manifest, mesh, lock, stopwatch, console, callback)
 
 
 def _train_in_run_dir(
     config: RunConfig,
-    points: Sequence[RunConfig],
+    run_configs: Sequence[RunConfig],
     compiled_world: CompiledWorld,
     manifest: dict[str, Any],
     mesh: Mesh | None,
@@ -194,7 +194,7 @@ def _train_in_run_dir(
     console: PlainConsole,
     callback: TrainCallback | None,
 ) -> None:
-    """Train in a run directory whose lock is held; see `train_points`."""
+    """Train in a run directory whose lock is held; see `train_runs`."""
     # A directory of policies alone was copied without its training state, or is that of a run of a batch.
     has_training_state = has_preparation(config.run_dir) or has_checkpoints(config.run_dir)
     if (config.run_dir / POLICIES_DIR).exists() and not has_training_state:
@@ -210,7 +210,7 @@ def _train_in_run_dir(
         _finish_fitted_run(config, compiled_world, preparation, lock, stopwatch, console)
         return
 
-    trainer = make_trainer(config, compiled_world.env, estimator_config, knowledge, mesh, points)
+    trainer = make_trainer(config, compiled_world.env, estimator_config, knowledge, mesh, run_configs)
 
     # Draw the bank of scenes in which each chunk trains.
     bank_order = draw_bank_order(compiled_world, config.seed, config.total_updates // config.chunk)
@@ -223,8 +223,8 @@ def _train_in_run_dir(
     env_params = compiled_world.make_env_params(bank_order[0])
     states, update = _restore_or_init(config, trainer, env_params, manifest, console)
     stopwatch = stopwatch.resume(config.run_dir / TIMES_FILE)
-    has_reach = all((point.run_dir / REACH_FILE).exists() for point in points)
-    is_finished = update == config.total_updates and has_reach
+    has_success_by_budget = all((run_config.run_dir / REACH_FILE).exists() for run_config in run_configs)
+    is_finished = update == config.total_updates and has_success_by_budget
     validator = None if is_finished else _make_validator(config, trainer, knowledge, compiled_world, console)
 
     session = TrainingSession(
@@ -235,20 +235,20 @@ def _train_in_run_dir(
     # Export the best policies of each run, and measure them.
     seed_states = trainer.unpack(states)
     first_seed = 0
-    for point in points:
+    for run_config in run_configs:
         policies = {}
         for arm, arm_states in seed_states.items():
-            point_states = arm_states[first_seed : first_seed + point.seeds]
-            policies[arm] = [_best_params(state) for state in point_states]
+            run_states = arm_states[first_seed : first_seed + run_config.seeds]
+            policies[arm] = [_best_params(state) for state in run_states]
         # Folders of the runs of a batch are made here; of a single run, this repeats the check.
-        run_on_first_process(functools.partial(claim_run_dir, point))
-        if point.run_dir != config.run_dir:
-            run_on_first_process(functools.partial(_copy_logs, config, point, first_seed))
-        export = functools.partial(_export_policies, point, policies, estimator_config, knowledge, exploration)
+        run_on_first_process(functools.partial(claim_run_dir, run_config))
+        if run_config.run_dir != config.run_dir:
+            run_on_first_process(functools.partial(_copy_logs, config, run_config, first_seed))
+        export = functools.partial(_export_policies, run_config, policies, estimator_config, knowledge, exploration)
         run_on_first_process(export)
         if validator is not None:
-            _write_reach(point, validator, policies, console)
-        first_seed += point.seeds
+            _write_success_by_budget(run_config, validator, policies, console)
+        first_seed += run_config.seeds
     console.print(f"{config.run_dir}: done in {stopwatch.read()['wall_s']:.0f} s")
 
 
@@ -525,11 +525,11 @@ def _finish_fitted_run(
         except MissingSplitError as error:
             console.print(f"no val scenes, so the policies are not measured ({error})")
         else:
-            _write_reach(config, validator, policies, console)
+            _write_success_by_budget(config, validator, policies, console)
     console.print(f"{config.run_dir}: done in {stopwatch.read()['wall_s']:.0f} s")
 
 
-def _write_reach(
+def _write_success_by_budget(
     config: RunConfig, validator: Validator, policies: Mapping[str, Sequence[Params]], console: PlainConsole
 ) -> None:
     """Measure the exported policies of a run, and store their success within budgets of actions."""
@@ -538,20 +538,20 @@ def _write_reach(
     run_on_first_process(lambda: write_json_with_digest(config.run_dir / REACH_FILE, success_by_budget))
 
 
-def _copy_logs(config: RunConfig, point: RunConfig, first_seed: int) -> None:
+def _copy_logs(config: RunConfig, run_config: RunConfig, first_seed: int) -> None:
     """Give a run of a batch its rows of the training log, with its own numbers of seeds, and the times of all.
 
     Args:
       config: configuration of the batch.
-      point: configuration of the run.
+      run_config: configuration of the run.
       first_seed: number of the run's first seed in the batch.
     """
-    point_rows = []
+    run_rows = []
     for row in RunLogs(config).read(LOG_FILE):
-        if first_seed <= row["seed"] < first_seed + point.seeds:
-            point_rows.append(row | {"seed": row["seed"] - first_seed})
-    write_log_rows(point.run_dir / LOG_FILE, point_rows)
-    write_log_rows(point.run_dir / TIMES_FILE, RunLogs(config).read(TIMES_FILE))
+        if first_seed <= row["seed"] < first_seed + run_config.seeds:
+            run_rows.append(row | {"seed": row["seed"] - first_seed})
+    write_log_rows(run_config.run_dir / LOG_FILE, run_rows)
+    write_log_rows(run_config.run_dir / TIMES_FILE, RunLogs(config).read(TIMES_FILE))
 
 
 def make_trainer(
@@ -560,7 +560,7 @@ def make_trainer(
     estimator_config: EstimatorConfig,
     knowledge: Knowledge,
     mesh: Mesh | None = None,
-    points: Sequence[RunConfig] | None = None,
+    run_configs: Sequence[RunConfig] | None = None,
 ) -> Trainer:
     """Make the trainer of all arms and seeds of a run.
 
@@ -570,8 +570,8 @@ def make_trainer(
       estimator_config: layout estimator. Training does not use the gap, so it is switched off.
       knowledge: knowledge from before training.
       mesh: mesh of devices; None for one device.
-      points: runs that are trained side by side, which differ from `config` in traced settings of PPO alone; the seeds
-        of each follow those of the one before. None for the run itself.
+      run_configs: runs that are trained side by side, which differ from `config` in traced settings of PPO alone; the
+        seeds of each follow those of the one before. None for the run itself.
     """
     policy_spec = config.policy_spec(len(env.categories))
     # Training episodes may start near their goals.
@@ -585,11 +585,11 @@ def make_trainer(
         learners[arm] = Learner(agent_loop, config.ppo, config.counterfactual)
 
     # Traced settings of each policy, stacked for each stage.
-    points = [config] if points is None else points
+    run_configs = [config] if run_configs is None else run_configs
     scalars_by_policy = []
-    for point in points:
-        point_scalars = point.ppo.stage_scalars(config.stages, config.stage_by_chunk, config.chunk)
-        scalars_by_policy += [point_scalars] * point.seeds
+    for run_config in run_configs:
+        run_scalars = run_config.ppo.stage_scalars(config.stages, config.stage_by_chunk, config.chunk)
+        scalars_by_policy += [run_scalars] * run_config.seeds
     stage_scalars = []
     for policy_scalars in zip(*scalars_by_policy, strict=True):
         stage_scalars.append(jax.tree.map(lambda *leaves: np.stack(leaves), *policy_scalars))
@@ -602,7 +602,7 @@ def make_trainer(
         stage_scalars=stage_scalars,
         knowledge=knowledge,
         key=jax.random.key(config.seed),
-        seeds=[seed for point in points for seed in range(point.seeds)],
+        seeds=[seed for run_config in run_configs for seed in range(run_config.seeds)],
         chunk_size=config.chunk,
     )
 

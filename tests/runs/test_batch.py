@@ -11,7 +11,7 @@ from support.tiny_run import tiny_config
 
 import jaxnav
 from jaxnav.errors import InputError
-from jaxnav.runs.batch import list_points, train_batch
+from jaxnav.runs.batch import list_run_configs, train_batch
 from jaxnav.runs.run import REACH_FILE
 
 
@@ -113,7 +113,7 @@ def test_a_batch_refuses_impossible_settings(tmp_path, settings, parts):
 
 def test_points_differ_in_the_settings_alone(tmp_path):
     config = tiny_config(tmp_path)
-    points = list_points(config, {"gamma": [0.9, 0.99]})
+    points = list_run_configs(config, {"gamma": [0.9, 0.99]})
     assert [point.ppo.gamma for point in points] == [0.9, 0.99]
     assert [point.run_dir for point in points] == [tmp_path / "run" / "0", tmp_path / "run" / "1"]
     for point in points:

@@ -23,8 +23,9 @@ VIEW_BLOCKED = 2
 
 #: Byte steps per metre ahead.
 AHEAD_SCALE = 51.0
-#: Byte steps per metre to the right; 0 m is byte 128.
+#: Byte steps per metre to the right, and the byte of 0 m.
 RIGHT_SCALE = 25.4
+RIGHT_ORIGIN = 128.0
 #: Byte steps per unit of apparent size.
 SIZE_SCALE = 127.5
 
@@ -160,7 +161,7 @@ def relative_position(detections: Any) -> tuple[Any, Any]:
     Returns:
       float [...] each; float64 for bytes, else of the type of the array.
     """
-    return detections[..., 1] / AHEAD_SCALE, (detections[..., 2] - 128.0) / RIGHT_SCALE
+    return detections[..., 1] / AHEAD_SCALE, (detections[..., 2] - RIGHT_ORIGIN) / RIGHT_SCALE
 
 
 def detected_positions(detections: np.ndarray, agent_position: np.ndarray, forward: np.ndarray) -> np.ndarray:
@@ -318,7 +319,7 @@ def _scale_to_bytes(
     byte_channels = (
         np.maximum(np.rint(255.0 * np.clip(confidence, 0.0, 1.0)), 1.0),
         np.rint(AHEAD_SCALE * ahead),
-        128.0 + np.rint(RIGHT_SCALE * right),
+        RIGHT_ORIGIN + np.rint(RIGHT_SCALE * right),
         np.rint(SIZE_SCALE * apparent_size),
     )
     return np.clip(np.stack(byte_channels, axis=-1), 0.0, 255.0)
