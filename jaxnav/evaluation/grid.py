@@ -10,7 +10,7 @@ success weighted by action efficiency (SAE) and distance to success (DTS).
 
 import functools
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -154,11 +154,9 @@ class Evaluator:
         """
         self.compilations = 0
         self._agent_loop = agent_loop
-        self._compiled_parts = {
-            "can_remove": can_remove,
-            "has_controls": has_controls,
-            "replaced_parts": replaced_parts,
-        }
+        self._infer_and_act = functools.partial(
+            infer_and_act, can_remove=can_remove, has_controls=has_controls, replaced_parts=replaced_parts
+        )
         self._compiled_run = jax.jit(self._run_grid)
 
     def __call__(
@@ -218,7 +216,7 @@ class Evaluator:
                 agent_loop=self._agent_loop,
                 env_params=env_params,
                 knowledge=knowledge,
-                **self._compiled_parts,
+                infer_and_act=self._infer_and_act,
             )
 
         return jax.lax.map(run_entry, grid)
@@ -244,9 +242,12 @@ def _run_episodes(
     agent_loop: AgentLoop,
     env_params: EnvParams,
     knowledge: Knowledge,
-    **compiled_parts: Any,
+    infer_and_act: Callable[..., tuple[Agent, StepResult, InferenceTrace]],
 ) -> EpisodeOutcome:
-    """Run all episodes of one grid entry until every episode has ended."""
+    """Run all episodes of one grid entry until every episode has ended.
+
+    `infer_and_act` is the function of this name with the features that the evaluator compiles.
+    """
     num_episodes = len(initial_states.pose)
     policy_key = jax.random.fold_in(key, config.policy_index)
     episode_keys = jax.vmap(lambda episode: jax.random.fold_in(policy_key, episode))(jnp.arange(num_episodes))
@@ -254,9 +255,7 @@ def _run_episodes(
     context = DecisionContext(policy, config.use_layout, agent_loop, knowledge, env_params)
 
     def step(batch: EpisodeBatch) -> EpisodeBatch:
-        next_agent, result, trace = infer_and_act(
-            config, context, batch.agent, batch.running, batch.episode_keys, **compiled_parts
-        )
+        next_agent, result, trace = infer_and_act(config, context, batch.agent, batch.running, batch.episode_keys)
         # The memory holds the executed action, which differs from the choice where the method has macro-actions.
         action = policy_memory(result.agent).action
         is_decision_step = agent_loop.is_decision_step(batch.agent)  # of the state before the step
