@@ -136,10 +136,8 @@ def name_evaluation(command: str, split: str, world: str | None, scenes: Path | 
       scenes: scene file; None without one.
       details: texts for other options that change the results; None for options that are not given.
     """
-    source = world
-    if source is None and scenes is not None:
-        source = f"scenes-{name_path(scenes)}"  # never the name of a world
-    name = "-".join(part for part in (command, source, split, *details) if part is not None)
+    scenes_part = None if scenes is None else f"scenes-{name_path(scenes)}"  # never the name of a world
+    name = "-".join(part for part in (command, world, scenes_part, split, *details) if part is not None)
     return name if len(name) <= _MAX_NAME_LENGTH else f"{name[:_MAX_NAME_LENGTH]}-{_short_digest(name)}"
 
 
@@ -147,7 +145,10 @@ def name_subject(subject: str) -> str:
     """Return the part of a file name that stands for a policy or an agent: its name, or that of its folder."""
     if os.sep in subject:
         return name_path(Path(subject))
-    return re.sub(r"[^A-Za-z0-9._-]", "_", subject)[: _MAX_NAME_LENGTH // 2]
+    # A module has no `-`, so `module:AGENT` stays apart from all others; a digest replaces what a file name lacks.
+    readable_name = subject.replace(":", "-")
+    name = re.sub(r"[^A-Za-z0-9._-]", "_", readable_name)[: _MAX_NAME_LENGTH // 2]
+    return name if name == readable_name else f"{name}-{_short_digest(subject)}"
 
 
 def name_path(path: Path) -> str:

@@ -156,12 +156,15 @@ def _evaluate_or_print(config: EvalConfig, console: Console) -> None:
         seed=config.seed,
         console=console,
     )
-    _print_report(results.report, config.format)
 
-    with refuse_unwritable(target, "--json"):
-        results.write(target)
-        if config.json is None:
-            write_latest("eval", target)
+    # Write first, so that nothing is lost if the reader of a pipe ends; print also what cannot be written.
+    try:
+        with refuse_unwritable(target, "--json"):
+            results.write(target)
+            if config.json is None:
+                write_latest("eval", target)
+    finally:
+        _print_report(results.report, config.format)
     num_compilations = results.report["compilations"]
     plural = "" if num_compilations == 1 else "s"
     compilation_text = f", {num_compilations} compilation{plural}" if num_compilations else ""
@@ -198,9 +201,11 @@ def _run_benchmark(config: EvalConfig, console: Console) -> None:
     scores = run_benchmark(
         config.subject, str(config.benchmark), config.tracks or None, console=console, **policy_options
     )
-    print_table(make_result_console(), scores_table(scores.rows), num_key_columns=2)
-    with refuse_unwritable(target, "--json"):
-        scores.write(target)
+    try:
+        with refuse_unwritable(target, "--json"):
+            scores.write(target)
+    finally:
+        print_table(make_result_console(), scores_table(scores.rows), num_key_columns=2)
     console.print(f"written to {target}")
 
 

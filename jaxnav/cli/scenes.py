@@ -43,7 +43,8 @@ class ImportConfig:
         `--base`. `scenes`: a scene file, to divide it into splits.
       source: file or folder to read; with `--from-controller`, names of scenes, separated by commas.
       out: scene file to write (`*.jsonl.gz`). A file with other scenes is never replaced.
-      split: split of the scenes that match none of the patterns `--val` and `--test`.
+      split: split of the scenes that match none of the patterns `--val` and `--test`. By default, scenes of a scene
+        file keep their split, and all others are of split train.
       val: patterns of scene names, such as `FloorPlan_Val1_*`, that become the split val.
       test: patterns of scene names that become the split test.
       room_types: room types of the scenes to keep, such as `house`. The default is all.
@@ -62,7 +63,7 @@ class ImportConfig:
     format: SceneFormat
     source: str
     out: Path
-    split: Split = "train"
+    split: Split | None = None
     val: tuple[str, ...] = ()
     test: tuple[str, ...] = ()
     room_types: tuple[str, ...] = ()
@@ -142,7 +143,7 @@ def _import(config: ImportConfig, console: Console) -> None:
     scenes = read_source(
         config.format,
         config.source,
-        config.split,
+        config.split or "train",
         assets=config.assets,
         maps=config.maps,
         from_controller=config.from_controller,
@@ -193,9 +194,13 @@ def _show(config: ShowConfig, console: Console) -> None:
     require_plotting_packages()
     from jaxnav.viz.scene import draw_scene
 
-    # Pictures of one scene at two layout shifts have different names.
+    # Pictures of one scene, or of scenes of one name, in different layouts have different names.
     scene = config.select_scene(config.scene, config.index)
     shift_suffix = f"-shift-{config.shift:g}" if config.shift else ""
+    if config.shift_by != ShowConfig.shift_by:
+        shift_suffix += f"-by-{config.shift_by}"
+    if config.seed != ShowConfig.seed:
+        shift_suffix += f"-seed-{config.seed}"
     path = config.out or Path(re.sub(r"[^\w.-]", "_", scene.name) + shift_suffix + ".png")
     if path.suffix != ".png":
         raise InputError(f"--out {path}: give a name that ends in .png")

@@ -116,16 +116,18 @@ def _run_sweep(config: SweepConfig, console: Console) -> None:
         console=console,
     )
     rows = [row for result in results for row in result.rows()]
-    _print_tables(rows, results[0].notes(), config.format)
 
-    # Write the numbers first: drawing them needs optional packages.
+    # Write the numbers first, so that nothing is lost if the reader of a pipe ends or drawing fails.
+    try:
+        with refuse_unwritable(numbers_path, "--out"):
+            _write_numbers(results, rows, numbers_path)
+            if config.out is None:
+                write_latest("sweep", numbers_path)
+    finally:
+        _print_tables(rows, results[0].notes(), config.format)
     compilations = sum(result.compilations for result in results)
     plural = "" if compilations == 1 else "s"
     console.print(f"{compilations} compilation{plural} for all thresholds, seeds and shifts")
-    with refuse_unwritable(numbers_path, "--out"):
-        _write_numbers(results, rows, numbers_path)
-        if config.out is None:
-            write_latest("sweep", numbers_path)
     console.print(f"numbers: {numbers_path}")
     with refuse_unwritable(figure_path, "--out"):
         _draw_figure(results, figure_path, console)

@@ -338,6 +338,9 @@ class ObjectNav:
         poses = np.array([*path, int(state.pose)])
         cells = self.cell_of_pose(poses) - int(params.tables.first_cell[scene])
         renderer = self.renderers[scene]
+        for pose, cell in zip(poses.tolist(), cells.tolist(), strict=True):
+            if not 0 <= cell < renderer.num_cells:
+                raise InputError(f"render: pose {pose} is of another scene; give poses of the episode of the state")
         if mode == "ansi":
             return renderer.draw_text(cells, heading, int(state.goal))
         return renderer.draw_pixels(cells, heading, int(state.goal), size)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaxnav.scenes.categories import category_ids
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import CELL_SIZE, Scene, scene_extent
 from jaxnav.scenes.tables.observation_row import MAX_RANGE
@@ -101,9 +102,15 @@ def plan_characters(scene: Scene) -> np.ndarray:
     return np.where(scene.walls, WALL_CHARACTER, np.where(scene.reach, FLOOR_CHARACTER, FURNITURE_CHARACTER))
 
 
-def goal_cells(scene: Scene, goal: str) -> np.ndarray:
+def goal_places(scene: Scene, task: Task, goal: int) -> np.ndarray:
+    """Return the world positions (x, z) of the objects of a category, by name or alias, float64 [N, 2]."""
+    is_goal = np.array(category_ids(scene.types, task.categories), int) == goal
+    return scene.boxes[is_goal][:, [0, 2]]
+
+
+def goal_cells(scene: Scene, task: Task, goal: int) -> np.ndarray:
     """Return the cells (z, x) of the objects of a category inside the grid, int [N, 2]."""
-    places = scene.boxes[[name == goal for name in scene.types]][:, [0, 2]]
+    places = goal_places(scene, task, goal)
     cells = np.rint((places - scene.origin) / CELL_SIZE).astype(int)[:, ::-1]
     return cells[((cells >= 0) & (cells < scene.walls.shape)).all(axis=1)]
 
@@ -124,6 +131,11 @@ class SceneRenderer:
         self._plans: dict[int, np.ndarray] = {}  # by size
         self._outlines: dict[tuple[float, ...], np.ndarray] = {}
         self._low_corner, self._high_corner = scene_extent(scene)
+
+    @property
+    def num_cells(self) -> int:
+        """Number of cells on which the agent can stand."""
+        return len(self._cells)
 
     def draw_pixels(self, cells: Sequence[int], heading: int, goal: int, size: int) -> np.ndarray:
         """Draw the agent at the end of a path.
@@ -146,8 +158,7 @@ class SceneRenderer:
         yaw = 360.0 / self.task.rules.headings * heading
 
         self._blend_cone(pixels, places[-1], yaw, scale)
-        is_goal = [name == self.task.categories[goal] for name in self.scene.types]
-        for place in self.scene.boxes[is_goal][:, [0, 2]]:
+        for place in goal_places(self.scene, self.task, goal):
             self._fill_star(pixels, place, scale)
         for place in places[:-1]:
             self._fill_disc(pixels, place, 0.05, scale)
@@ -158,7 +169,7 @@ class SceneRenderer:
         """Draw the agent at the end of a path as text; see `draw_pixels`."""
         rows = plan_characters(self.scene)
         goal_name = self.task.categories[goal]
-        rows[tuple(goal_cells(self.scene, goal_name).T)] = GOAL_CHARACTER
+        rows[tuple(goal_cells(self.scene, self.task, goal).T)] = GOAL_CHARACTER
         rows[tuple(self._cells[list(cells)].T)] = PATH_CHARACTER
         direction = round(8 * heading / self.task.rules.headings) % 8
         rows[tuple(self._cells[cells[-1]])] = _AGENT_CHARACTERS[direction]

@@ -221,7 +221,7 @@ def _map_text(game: Game, poses: list[int], shortest_poses: list[int], columns: 
         mark_rows.append([(cell_character + separator, MUTED_STYLE) for cell_character in character_row])
 
     # Mark the objects of the goal's category.
-    for iz, ix in goal_cells(scene, game.goal).tolist():
+    for iz, ix in goal_cells(scene, game.compiled_world.env.task, int(game.episode.goal[0])).tolist():
         mark_rows[iz][ix] = (GOAL_CHARACTER + separator, GOAL_STYLE)
 
     # Mark the shortest path, the path of the player over it, and the start.

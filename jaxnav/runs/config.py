@@ -10,13 +10,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+
 from jaxnav.choices import CounterfactualMemory, Counts, Reduction, WorldName
 from jaxnav.errors import InputError
 from jaxnav.policies.spec import DecisionKind, Direct, PolicySpec, Sizes, WeightKind
+from jaxnav.runs.config_files import apply_values
 from jaxnav.scenes.tables.observation_row import Detector
 from jaxnav.scenes.task import FrontCell, Task
 from jaxnav.scenes.worlds import WORLDS
-from jaxnav.store.files import expand_home
 from jaxnav.training.config import CounterfactualTraining, PPOConfig, stage_index_at
 
 if TYPE_CHECKING:
@@ -434,12 +436,7 @@ def check_config(config: RunConfig) -> RunConfig:
     Raises:
       InputError: names the first impossible setting.
     """
-    # Paths from files and Python callers may be text. Only a world on disk needs the cache, and thus a home folder.
-    config = dataclasses.replace(config, cache=Path(config.cache))
-    for name in ("run_dir", "scenes"):
-        path_setting = getattr(config, name)
-        if path_setting is not None:
-            config = dataclasses.replace(config, **{name: expand_home(path_setting)})
+    config = _convert_fields(config)
 
     # Settings that follow from the world, the method and the decision.
     worlds = dataclasses.replace(config.worlds, front_cell=config.task.rules.front_cell)
@@ -684,6 +681,29 @@ def _check_world(config: RunConfig) -> None:
             unknown_goals.append(goal_category)
     advice = f"choose from the categories {', '.join(task.categories)}"
     _require(not unknown_goals, "worlds.goals", unknown_goals, advice)
+
+
+def _convert_fields(config: RunConfig) -> RunConfig:
+    """Convert settings that were given in Python to their types, as those of a file.
+
+    Raises:
+      InputError: a value has another type than its setting.
+    """
+    settings = _to_plain_values(dataclasses.asdict(config))
+    # Only a world on disk needs the cache, and thus a home folder.
+    cache = Path(settings.pop("cache"))
+    return dataclasses.replace(apply_values(RunConfig(), settings, Path("config")), cache=cache)
+
+
+def _to_plain_values(value: Any) -> Any:
+    """Return a value as a file holds it: paths are text, tuples lists, and numbers of NumPy those of Python."""
+    if isinstance(value, dict):
+        return {name: _to_plain_values(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_to_plain_values(item) for item in value]
+    if isinstance(value, np.generic):
+        return value.item()
+    return str(value) if isinstance(value, Path) else value
 
 
 def _require(condition: bool, name: str, value: object, advice: str) -> None:

@@ -18,6 +18,7 @@ from jaxnav.runs.config import RunConfig, check_config
 from jaxnav.runs.config_files import apply_values
 from jaxnav.runs.policies import CONFIG_FILE, POLICIES_DIR, Policies, check_path, is_policy, load_policies
 from jaxnav.store.files import (
+    LOCK_FILE,
     FolderLock,
     LogRow,
     append_log_rows,
@@ -192,9 +193,10 @@ def lock_run_dir(config: RunConfig) -> Iterator[FolderLock]:
     folder_lock = FolderLock(config.run_dir)
 
     def claim_and_lock() -> None:
-        claim_run_dir(config)
+        check_run_dir(config)  # a directory of something else gets no lock file
+        config.run_dir.mkdir(parents=True, exist_ok=True)
         folder_lock.acquire()
-        claim_run_dir(config)  # another process may have claimed it before the lock was acquired
+        claim_run_dir(config)
 
     try:
         run_on_first_process(claim_and_lock)
@@ -212,6 +214,18 @@ def claim_run_dir(config: RunConfig) -> None:
     Raises:
       InputError: the directory holds another run or other files.
     """
+    check_run_dir(config)
+    path = config.run_dir / CONFIG_FILE
+    if not path.exists():
+        write_json_with_digest(path, run_settings(config))
+
+
+def check_run_dir(config: RunConfig) -> None:
+    """Check that the run directory holds this run, or nothing yet.
+
+    Raises:
+      InputError: the directory holds another run or other files.
+    """
     run_dir = config.run_dir
     path = run_dir / CONFIG_FILE
 
@@ -225,12 +239,12 @@ def claim_run_dir(config: RunConfig) -> None:
             )
         return
 
-    # Any other directory must be empty, except for temporary files of a call that was killed in this function.
+    # Any other directory must be empty, except for what a call leaves that was killed before it wrote the settings.
     if run_dir.exists() and not run_dir.is_dir():
         raise InputError(f"{run_dir}: is a file; choose another --run-dir")
-    if run_dir.exists() and any(not folder_item.match(f".{CONFIG_FILE}.*.tmp") for folder_item in run_dir.iterdir()):
-        raise InputError(f"{run_dir}: is not empty and holds no run; choose another --run-dir")
-    write_json_with_digest(path, run_settings(config))
+    for folder_item in run_dir.iterdir() if run_dir.exists() else ():
+        if folder_item.name != LOCK_FILE and not folder_item.match(f".{CONFIG_FILE}.*.tmp"):
+            raise InputError(f"{run_dir}: is not empty and holds no run; choose another --run-dir")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -126,7 +126,7 @@ def _import_subject(name: str) -> PolicySubject | AgentSubject:
         sys.path.insert(0, working_directory)
     try:
         module = importlib.import_module(module_name)
-    except Exception as error:  # any exception that the foreign module raises
+    except (Exception, SystemExit) as error:  # whatever the foreign module raises, `sys.exit` of a script included
         raise InputError(
             f"{name}: cannot be imported ({type(error).__name__}: {error}); give package.module:AGENT"
         ) from error

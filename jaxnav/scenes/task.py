@@ -6,10 +6,11 @@ and the ego-centric view.
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
+from jaxnav.errors import InputError, check_choice
 from jaxnav.scenes.categories import (
     GIBSON_CATEGORIES,
     GIBSON_GOALS,
@@ -56,6 +57,12 @@ class Rules:
     front_cell: FrontCell = dataclasses.field(default="nearest", repr=False)
     success: Literal["seen", "near"] = "seen"
     success_distance: float = 1.5
+
+    def __post_init__(self) -> None:
+        if type(self.headings) is not int or self.headings < 1:
+            raise InputError(f"Rules.headings {self.headings!r}: give a whole number of at least 1")
+        check_choice("Rules.success", self.success, ("seen", "near"))
+        check_choice("Rules.front_cell", self.front_cell, get_args(FrontCell))
 
     @property
     def poses_per_cell(self) -> int:
@@ -166,6 +173,23 @@ class Task:
     def is_goal(self) -> np.ndarray:
         """Return where categories can be goals, bool [K]."""
         return np.array([not self.goals or name in self.goals for name in self.categories])
+
+    def check(self) -> None:
+        """Check that scenes can be compiled for this task.
+
+        Raises:
+          InputError: a category occurs twice, a goal is no category, or a rate of the detector is no probability.
+        """
+        for name in self.categories:
+            if self.categories.count(name) > 1:
+                raise InputError(f"Task.categories: {name!r} occurs more than once; give each category once")
+        for name in self.goals:
+            if name not in self.categories:
+                raise InputError(f"Task.goals: {name!r} is no category; choose from {', '.join(self.categories)}")
+        for name in ("miss_near", "miss_far", "false_alarm"):
+            rate = getattr(self.detector, name)
+            if not 0.0 <= rate <= 1.0:  # also refuses NaN
+                raise InputError(f"Task.detector.{name} {rate}: give a probability from 0 to 1")
 
 
 def _lists_to_tuples(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -18,7 +18,7 @@ import numpy as np
 from jaxnav.choices import ShiftKind, Split, WorldName
 from jaxnav.errors import InputError, MissingSplitError, check_choice
 from jaxnav.scenes.context_exchange import ContextExchange, fit_context_exchange
-from jaxnav.scenes.files.scene_file import iterate_scenes, read_bytes, read_scenes, remove_headers
+from jaxnav.scenes.files.scene_file import iterate_scenes, parse_scenes, read_bytes, remove_headers
 from jaxnav.scenes.generate.homes import generate_apartment, generate_house
 from jaxnav.scenes.generate.rooms import generate_room
 from jaxnav.scenes.layout_shift import exchange_places
@@ -252,13 +252,17 @@ def fit_scene_exchange(scenes: Scenes | Sequence[Scene], task: Task) -> ContextE
     """Fit the exchange of categories that misleads most to training scenes; see `fit_context_exchange`.
 
     Args:
-      scenes: training scenes without a shift, of which 100 are read.
+      scenes: training scenes without a shift, of which 100 are read, and all of a room type that these lack.
       task: task whose categories exchange their places.
 
     Raises:
       InputError: no exchange misleads in any room type.
     """
-    indices = np.unique(np.linspace(0, len(scenes) - 1, min(_MAX_FITTED_SCENES, len(scenes))).astype(int))
+    indices = np.unique(np.linspace(0, len(scenes) - 1, min(_MAX_FITTED_SCENES, len(scenes))).astype(int)).tolist()
+    # Rare room types of a file, which an even spread may miss.
+    if isinstance(scenes, FileScenes):
+        read_types = {scenes[index].room_type for index in indices}
+        indices += [index for index, scene in enumerate(scenes.scenes) if scene.room_type not in read_types]
     context_exchange = fit_context_exchange((scenes[int(index)] for index in indices), task)
     if not any(context_exchange.values()):
         raise InputError("--shift-by context: no exchange of categories misleads in the training scenes; use size")
@@ -307,14 +311,15 @@ def load_scenes(path: str | Path, split: str | None) -> FileScenes:
     # An unknown name of a split is reported before the file is read.
     if split is not None:
         check_choice("--split", split, SPLITS)
-    scenes = read_scenes(path)
+    content = read_bytes(expand_home(path))
+    scenes = parse_scenes(expand_home(path), content)
     scenes_of_split = tuple(scene for scene in scenes if split in (None, scene.split))
     if not scenes_of_split:
         splits_in_file = sorted({scene.split for scene in scenes})
         raise MissingSplitError(f"{path}: holds no scene of split {split!r}; it holds {', '.join(splits_in_file)}")
 
     # The identity follows the scenes of the file, not its name or the account of its import.
-    file_checksum = hashlib.sha256(remove_headers(read_bytes(expand_home(path)))).hexdigest()
+    file_checksum = hashlib.sha256(remove_headers(content)).hexdigest()
     return FileScenes(scenes_of_split, f"{split or 'all'} of {file_checksum}")
 
 

@@ -15,6 +15,7 @@ import json
 import math
 import os
 import socket
+import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
@@ -58,8 +59,8 @@ def write_atomic(path: Path, data: bytes) -> None:
     """
     # The temporary file is in the same folder, because a rename is atomic only within one file system.
     path.parent.mkdir(parents=True, exist_ok=True)
-    # A part of the name keeps it within the limit of the file system.
-    temporary_path = path.with_name(f".{path.name[:40]}.{os.getpid()}.tmp")
+    # A part of the name keeps it within the limit of the file system; other writers have other temporary files.
+    temporary_path = path.with_name(f".{path.name[:40]}.{uuid.uuid4().hex}.tmp")
     try:
         with _name_file(path), temporary_path.open("wb") as temporary_file:
             temporary_file.write(data)

@@ -152,6 +152,17 @@ def test_eval_report_names_differ_for_a_world_and_a_file():
     assert report_names[:2] == ["run/eval-val.json", "run/eval-rooms-val.json"]
     assert re.fullmatch("run/eval-scenes-rooms-[0-9a-f]{8}-val.json", report_names[2])
 
+    # Agents take a world and a file, and names of agents stay apart.
+    agents = [
+        EvalConfig("my:agent_x", world="houses"),
+        EvalConfig("my:agent_x", world="houses", scenes=scene_file),
+        EvalConfig("my:agent_x", world="houses", scenes=Path("elsewhere/homes.jsonl.gz")),
+        EvalConfig("my_agent:x", world="houses"),
+        EvalConfig("my:ägent", world="houses"),
+        EvalConfig("my:ögent", world="houses"),
+    ]
+    assert len({_find_target(config) for config in agents}) == len(agents)
+
 
 def test_scores_of_other_settings_have_other_files():
     config = EvalConfig("rooms-org", benchmark="v2")

@@ -62,8 +62,13 @@ def test_import_divides_a_file_into_splits_by_pattern(tmp_path, capsys):
     assert [scene.split for scene in read_scenes(first_target)] == ["train", "val", "test", "val"]
 
     # A scene file can be divided anew.
-    assert import_scenes("scenes", first_target, second_target, "--test", "FloorPlan1") == 0
+    assert import_scenes("scenes", first_target, second_target, "--test", "FloorPlan1", "--split", "train") == 0
     assert [scene.split for scene in read_scenes(second_target)] == ["test", "train", "train", "train"]
+
+    # Without a split, scenes of a scene file keep theirs: no test scene becomes one of training.
+    kept_target = tmp_path / "c.jsonl.gz"
+    assert import_scenes("scenes", first_target, kept_target, "--largest", "99") == 0
+    assert [scene.split for scene in read_scenes(kept_target)] == ["train", "val", "test", "val"]
     assert "4 scenes imported, 0 refused" in capsys.readouterr().err
 
 

@@ -8,11 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import tiny_world as tiny
+from support.scenes import SMALL, draw
 
 from jaxnav.env.objectnav import State
-from jaxnav.env.render import AGENT_COLOR, GOAL_COLOR, SceneRenderers, parse_color
+from jaxnav.env.render import AGENT_COLOR, GOAL_COLOR, SceneRenderer, SceneRenderers, goal_cells, parse_color
 from jaxnav.errors import InputError
 from jaxnav.scenes.scene import scene_extent
+from jaxnav.scenes.task import Task
 from jaxnav.scenes.worlds import FileScenes
 
 BARE_ENV, PARAMS = tiny.world()
@@ -61,6 +63,16 @@ def test_pixels_change_with_the_pose_and_not_the_cached_plan():
     np.testing.assert_array_equal(first, ENV.render(state_at(0), PARAMS))
 
 
+def test_goals_are_found_by_their_alias():
+    # A stool counts as a chair. It stands in the cell (z, x) = (1, 2).
+    room = draw(["...."] * 3, ("Stool", 0.5, 0.3, 0.25, *SMALL))
+    task = Task(("Bed", "Chair"))
+    assert goal_cells(room, task, 1).tolist() == [[1, 2]]
+    assert goal_cells(room, task, 0).tolist() == []
+    pictures = [SceneRenderer(room, task).draw_text([0], 0, goal) for goal in (0, 1)]
+    assert [picture.count("★") for picture in pictures] == [1, 2]  # one is in the line below the picture
+
+
 def test_text_shows_agent_path_and_goals():
     heading_right = ENV.task.rules.headings // 4
     text = ENV.render(state_at(3, heading_right), PARAMS, mode="ansi", path=[int(state_at(0).pose)])
@@ -89,6 +101,8 @@ def test_scenes_are_found_by_name_where_the_bank_lacks_some():
         ),
         (ENV, state_at(0), {"mode": "human"}, "mode 'human'; choose rgb_array or ansi"),
         (ENV, state_at(0), {"size": 3}, "size 3; give at least 16"),
+        (ENV, state_at(0), {"path": [-5]}, "pose -5 is of another scene; give poses of the episode"),
+        (ENV, state_at(0), {"path": [10**6]}, "pose 1000000 is of another scene"),
     ],
 )
 def test_render_refuses_bad_input(env, state, options, message):

@@ -99,6 +99,22 @@ def test_lock_run_dir_refuses_a_second_run_until_released(tmp_path):
         pass
 
 
+def test_lock_run_dir_writes_no_settings_into_a_directory_that_another_run_holds(tmp_path):
+    """The other run has the lock, and has not written its settings yet."""
+    config = tiny_config(tmp_path)
+    config.run_dir.mkdir()
+    other_lock = FolderLock(config.run_dir)
+    other_lock.acquire()
+    with pytest.raises(InputError, match="is writing to it"), lock_run_dir(config):
+        pass
+    assert not (config.run_dir / "config.json").exists()
+
+    # The lock file that a killed run left is no other content.
+    other_lock.release()
+    with lock_run_dir(config):
+        assert (config.run_dir / "config.json").exists()
+
+
 def test_lock_run_dir_reports_a_removed_directory_before_other_errors(tmp_path):
     """A save, for one, of which Orbax tells much else."""
     config = tiny_config(tmp_path)

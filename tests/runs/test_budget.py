@@ -4,6 +4,7 @@ import dataclasses
 import json
 
 import chex
+import numpy as np
 import pytest
 from support.stopping import train_in_two
 
@@ -25,6 +26,28 @@ CONFIG = RunConfig(
     ppo=PPOConfig(num_envs=64, rollout=10, minibatches=4),
     layout=LayoutConfig(walks=30, steps=20),
 )
+
+
+@pytest.mark.parametrize(
+    ("settings", "key"),
+    [
+        ({"world": "gardens"}, "world"),
+        ({"counterfactual": "distill"}, "counterfactual"),
+        ({"arms": ("base",)}, "arms"),
+        ({"seeds": 2.5}, "seeds"),
+        ({"total_steps": 1e6}, "total_steps"),
+        ({"layout": LayoutConfig(setting="Paper")}, "layout.setting"),
+        ({"ppo": PPOConfig(num_envs=64.0)}, "ppo.num_envs"),
+    ],
+)
+def test_settings_of_another_type_are_refused_in_python_too(settings, key):
+    with pytest.raises(InputError, match=f"^config: {key} must be "):
+        check_config(dataclasses.replace(CONFIG, **settings))
+
+
+def test_numbers_of_numpy_are_those_of_python():
+    config = check_config(dataclasses.replace(CONFIG, seeds=np.int64(2), arms=["layout"]))
+    assert (type(config.seeds), config.seeds, config.arms) == (int, 2, ("layout",))
 
 
 def test_imitation_stage_counts_towards_the_step_budget():
@@ -54,7 +77,7 @@ def test_stage_share_is_rounded_to_whole_chunks(share, chunks):
     [
         ({"imitation": 0.0}, "config: imitation is 0.0; give a share between 0 and 1, both excluded"),
         ({"imitation": 1.0}, "config: imitation is 1.0; give a share between 0 and 1, both excluded"),
-        ({"imitation": float("nan")}, "config: imitation is nan; give a share"),
+        ({"imitation": float("nan")}, "config: imitation must be float or null, but is nan"),
         ({"imitation": 0.95}, "config: imitation is 0.95; stage 2 of method 'vtnet', a share of 0.05, gets none"),
         ({"total_steps": 1}, "config: total_steps is 1; stage 2 of method 'vtnet', a share of 0.8, gets none of the 1"),
         (

@@ -43,6 +43,7 @@ def agent_module(tmp_path, monkeypatch):
     """A working directory with a module of agents."""
     monkeypatch.chdir(tmp_path)
     Path("always.py").write_text(AGENT_MODULE)
+    Path("ending.py").write_text("import sys\nsys.exit(0)\n")  # a script without a main guard
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +109,7 @@ def test_eval_command_evaluates_an_agent_of_a_module(scene_file, capsys):
     assert "actions in" in printed.err
 
     # A report and a row for each episode, in the working directory.
-    (report_file,) = Path().glob("eval-always_always_done-*.json")
+    (report_file,) = Path().glob("eval-always-always_done-*.json")
     assert json.loads(report_file.read_text())["rows"][0]["variant"] == "agent"
     with Path(f"{report_file.name.removesuffix('.json')}.episodes.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -120,6 +121,7 @@ def test_eval_command_evaluates_an_agent_of_a_module(scene_file, capsys):
     ("subject", "message"),
     [
         ("always:alway_done", "always has no alway_done; did you mean always_done?"),
+        ("ending:AGENT", "cannot be imported (SystemExit: 0); give package.module"),
         ("nowhere:AGENT", "cannot be imported (ModuleNotFoundError: No module named 'nowhere'); give package.module"),
         ("rooms-orgg", "did you mean 'rooms-org' or 'houses-org'?"),
         ("always:returns_logits", "returns_logits: it returned actions float64 [16, 6]; expected int [16], an index"),

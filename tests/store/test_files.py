@@ -1,5 +1,6 @@
 """Atomic replacement of files."""
 
+import concurrent.futures
 import errno
 import os
 
@@ -20,6 +21,20 @@ def test_write_atomic_keeps_the_old_file_when_it_fails(tmp_path, monkeypatch):
         write_atomic(target_path, b"new")
     assert target_path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [target_path]
+
+
+def test_files_with_long_equal_beginnings_are_written_side_by_side(tmp_path):
+    # Temporary files have a part of the name, which must not be all that tells them apart.
+    names = [f"{'a' * 60}-{index}" for index in range(4)]
+
+    def write_and_read(name: str) -> bool:
+        for _ in range(20):
+            write_atomic(tmp_path / name, name.encode())
+        return (tmp_path / name).read_text() == name
+
+    with concurrent.futures.ThreadPoolExecutor() as threads:
+        assert all(threads.map(write_and_read, names))
+    assert sorted(path.name for path in tmp_path.iterdir()) == names
 
 
 def test_a_full_disk_names_the_file(tmp_path, monkeypatch):

@@ -175,7 +175,7 @@ def import_scenes(
     scenes: Iterable[Scene | InputError | ImportNote | ImportCount],
     source: str,
     out: Path,
-    split: Split = "train",
+    split: Split | None = None,
     val: tuple[str, ...] = (),
     test: tuple[str, ...] = (),
     categories: tuple[str, ...] | None = None,
@@ -187,7 +187,7 @@ def import_scenes(
       scenes: see `read_source`.
       source: file or folder that the scenes were read from, for error messages.
       out: scene file to write (`*.jsonl.gz`).
-      split: split of the scenes whose names match no pattern.
+      split: split of the scenes whose names match no pattern; None keeps the split with which they were read.
       val, test: patterns of scene names, such as `FloorPlan_Train11_*`, of these splits.
       categories: vocabulary that the types are compared with; None for that of the world that a scene stands for.
       report: called with the reason why a scene is refused.
@@ -218,7 +218,7 @@ def import_scenes(
         elif _fits_any(name, test):
             scene_split = "test"
         else:
-            scene_split = split
+            scene_split = split or scene.split
         divided_scenes.append(dataclasses.replace(scene, split=scene_split))
     try:
         write_scenes(out, divided_scenes, summary.account, replace=False)

@@ -36,7 +36,7 @@ _HALF_CHARACTER = re.compile("[\ud800-\udfff]")  # a surrogate without its partn
 
 # Header of a scene file, one line before the scenes; joined files have several.
 _HEADER_FIELD = "account"
-_HEADER_LINE = re.compile(rb'^\{"account":.*\n?', re.MULTILINE)
+_HEADER_LINE = re.compile(rb'^(?:\xef\xbb\xbf)?[ \t]*\{"account":.*\n?', re.MULTILINE)
 
 _CENTRE_COLUMNS = ("x", "y", "z")
 _SIZE_COLUMNS = ("sx", "sy", "sz")
@@ -64,8 +64,15 @@ def read_scenes(path: str | Path) -> list[Scene]:
         field and remedy.
     """
     path = expand_home(path)
+    return parse_scenes(path, read_bytes(path))
+
+
+def parse_scenes(path: Path, content: bytes) -> list[Scene]:
+    """Parse the content of a scene file, whose path errors name; see `read_scenes`."""
     scenes: list[Scene] = []
-    for scene in iterate_scenes(path):
+    for scene in _iterate_content(path, content):
+        if isinstance(scene, ImportCount):
+            continue
         if isinstance(scene, InputError):
             raise scene
         scenes.append(scene)
@@ -90,8 +97,13 @@ def iterate_scenes(path: Path) -> Iterator[Scene | InputError]:
 
 def iterate_counted_scenes(path: Path) -> Iterator[Scene | InputError | ImportCount]:
     """Read a scene file line by line, as `iterate_scenes`, and count the objects of each line after its scene."""
+    yield from _iterate_content(path, read_bytes(path))
+
+
+def _iterate_content(path: Path, content: bytes) -> Iterator[Scene | InputError | ImportCount]:
+    """Parse the content of a scene file line by line; see `iterate_counted_scenes`."""
     line_by_name: dict[str, int] = {}
-    for line_number, line_bytes in scene_lines(read_bytes(path)):
+    for line_number, line_bytes in scene_lines(content):
         object_count = ImportCount("objects")
         try:
             record = _parse_line(path, line_number, line_bytes)

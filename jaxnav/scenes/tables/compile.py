@@ -99,13 +99,15 @@ def compile_bank(scenes: Iterable[Scene], task: Task) -> Bank:
       task: task whose rules and detector apply.
 
     Raises:
-      InputError: no scene has a reachable goal.
+      InputError: an impossible task, or no scene has a reachable goal.
     """
     return join_scenes([compile_scene(scene, task) for scene in scenes], task)
 
 
 def compile_scene(scene: Scene, task: Task) -> Bank:
     """Compile one scene by the rules of docs/environment.md; the scene may be without a reachable goal."""
+    task.check()
+
     # Standable cells, and the moves between them.
     rules = task.rules
     cells = standable_cells(scene.reach)  # [C, 2]

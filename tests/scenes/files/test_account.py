@@ -1,5 +1,6 @@
 """Accounts of imports: everything read is kept, or skipped for a reason that is named."""
 
+import codecs
 import collections
 import copy
 import gzip
@@ -144,11 +145,22 @@ def test_account_of_scene_files_counts_objects_without_a_place(tmp_path):
     assert numbers(import_source(tmp_path / "b.jsonl.gz", "scenes", joined), "objects") == (4, 0, 4, {})
 
 
+@pytest.mark.parametrize("beginning", [codecs.BOM_UTF8, b"  "])
+def test_a_header_may_begin_like_any_line(tmp_path, beginning):
+    source = write_records(tmp_path / "source.jsonl.gz", RECORD)
+    import_source(tmp_path / "with.jsonl.gz", "scenes", source)
+    content = gzip.decompress((tmp_path / "with.jsonl.gz").read_bytes())
+    (tmp_path / "edited.jsonl").write_bytes(beginning + content)
+    edited, original = (load_scenes(tmp_path / name, None) for name in ("edited.jsonl", "with.jsonl.gz"))
+    assert [scene.name for scene in edited.scenes] == ["den"]
+    assert edited.identity == original.identity
+
+
 def test_identity_of_scenes_does_not_depend_on_the_header(tmp_path):
     source = write_records(tmp_path / "source.jsonl.gz", RECORD)
     summary = import_source(tmp_path / "with.jsonl.gz", "scenes", source, split="val")
     write_scenes(tmp_path / "without.jsonl.gz", read_scenes(tmp_path / "with.jsonl.gz"))
-    identities = {load_scenes(tmp_path / name, "train").identity for name in ("with.jsonl.gz", "without.jsonl.gz")}
+    identities = {load_scenes(tmp_path / name, "val").identity for name in ("with.jsonl.gz", "without.jsonl.gz")}
     assert summary.account
     assert len(identities) == 1
 

@@ -119,8 +119,9 @@ def lattice_cells(record: JsonRecord, field: str, points: Sequence[Sequence[floa
         worst_point = point_positions[lattice_offsets.argmax()].tolist()
         expected = f"x and z must be multiples of {CELL_SIZE} (within {SNAP_TOLERANCE})"
         raise record.error(field, f"holds {worst_point}; {expected}")
-    if (np.ptp(lattice_indices, axis=0) > MAX_SIDE_CELLS).any():
-        raise record.error(field, f"spans more than {MAX_SIDE_CELLS * CELL_SIZE:g} m; give one scene at a time")
+    max_span = MAX_SIDE_CELLS - 2 * _MARGIN - 1  # the array has a margin on both sides
+    if (np.ptp(lattice_indices, axis=0) > max_span).any():
+        raise record.error(field, f"spans more than {max_span * CELL_SIZE:g} m; give one scene at a time")
     return lattice_indices[:, ::-1]
 
 

@@ -160,10 +160,10 @@ def list_episode_files(path: Path) -> list[Path]:
         folder = folder / "content"
     elif folder != path:
         return [path]
-    folder_files = [file for file in list_visible_files(folder) if file.name.endswith(".json.gz")]
+    folder_files = [file for file in list_visible_files(folder) if file.name.endswith((".json.gz", ".json"))]
 
     # SemExp keeps `X_episodes.json.gz` next to Habitat's `X.json.gz` or `X.glb.json.gz`, which it does not use.
-    scene_names = [_strip_mesh_ending(file.name.removesuffix(".json.gz")) for file in folder_files]
+    scene_names = [_strip_mesh_ending(file.name.removesuffix(".gz").removesuffix(".json")) for file in folder_files]
     episode_files: list[Path] = []
     for file, scene_name in zip(folder_files, scene_names, strict=True):
         if f"{scene_name}_episodes" not in scene_names:

@@ -221,7 +221,7 @@ def _build_house(house: JsonRecord, name: str, split: str, objects: Sequence[Sce
     floor_corners = np.concatenate([room_floor.corners for room_floor in room_floors])
     low_index = np.floor(floor_corners.min(axis=0) / CELL_SIZE) - 1
     high_index = np.ceil(floor_corners.max(axis=0) / CELL_SIZE) + 1
-    if (high_index - low_index > MAX_SIDE_CELLS).any():
+    if (high_index - low_index + 1 > MAX_SIDE_CELLS).any():
         raise house.error("rooms", f"span more than {MAX_SIDE_CELLS * CELL_SIZE:g} m; give one house at a time")
     x = CELL_SIZE * np.arange(low_index[0], high_index[0] + 1)
     z = CELL_SIZE * np.arange(low_index[1], high_index[1] + 1)

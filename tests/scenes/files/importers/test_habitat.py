@@ -1,5 +1,6 @@
 """Import of Habitat ObjectNav episodes with and without semantic maps."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +53,15 @@ def test_read_habitat_accepts_folder_content_and_files_of_a_split(tmp_path, map_
         write_json(content / habitat_name, {"episodes": [episode(99.0, 0.0, 99.0)]})
     scenes, _ = scenes_and_errors(read_habitat(tmp_path / episode_path, "val", map_file))
     assert [scene.name for scene in scenes] == ["Home_floor0", "Home_floor1"]
+
+
+def test_read_habitat_reads_uncompressed_files_of_a_folder(tmp_path):
+    content = tmp_path / "val" / "content"
+    write_json(content / "Home.json.gz", EPISODES)
+    (content / "Home2.json").write_text(json.dumps(EPISODES).replace("Home", "Home2"))
+    scenes, errors = scenes_and_errors(read_habitat(tmp_path / "val", "val"))
+    assert not errors
+    assert {scene.name.partition("_")[0] for scene in scenes} == {"Home", "Home2"}
 
 
 @pytest.mark.parametrize("episode_path", ["train", "train/train.json.gz"])
