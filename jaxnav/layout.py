@@ -279,13 +279,13 @@ class LayoutEstimator(struct.PyTreeNode):
         if not config.own_column:
             counts = counts * (1 - diagonal)
 
-        # Eq. 4: the posterior adds them, where the gate is open.
-        is_accepted = jnp.bool_(True)
-        if config.gate:
-            is_accepted = (is_visible.sum() >= 2) & (is_visible != state.last_visible).any()
+        # Eq. 4: the posterior adds them, where the gate is open. The gap `clock` follows the gate of every estimator.
+        is_new_set = (is_visible.sum() >= 2) & (is_visible != state.last_visible).any()
+        is_accepted = is_new_set if config.gate else jnp.bool_(True)
+        is_gap_new = is_new_set if config.gap == "clock" else is_accepted
         next_state = LayoutState(
             alpha=jnp.where(is_accepted, state.alpha + counts, state.alpha),
-            last_visible=jnp.where(is_accepted, is_visible, state.last_visible),
+            last_visible=jnp.where(is_gap_new, is_visible, state.last_visible),
             gap=state.gap,
             co_seen=state.co_seen,
             sightings=state.sightings,
@@ -309,7 +309,7 @@ class LayoutEstimator(struct.PyTreeNode):
                 row_alpha = state.alpha + diagonal if config.own_column else state.alpha
                 # A new gap has already decayed in the later passes over this view.
                 new_gap = self._novelty(row_alpha, counts, visible) * config.decay ** (config.passes - 1)
-                gap = jnp.where(is_accepted, new_gap, state.gap * config.decay**config.passes)
+                gap = jnp.where(is_gap_new, new_gap, state.gap * config.decay**config.passes)
         return next_state.replace(gap=jnp.maximum(gap, state.gap) if config.hold else gap)
 
     @staticmethod

@@ -204,6 +204,15 @@ def test_held_gap_is_the_running_maximum(gap, views):
     )
 
 
+def test_clock_follows_the_gate_of_estimators_without_one():
+    # Two categories, the same two, none, other two: the clock starts anew in the first and the last view.
+    views = np.zeros((4, NUM_CATEGORIES), bool)
+    views[:2, :2] = views[3, 1:3] = True
+    expected = [1.0, 0.8, 0.64, 1.0]
+    for gate in (True, False):
+        np.testing.assert_allclose(gaps_along(views, gap="clock", gate=gate), expected, rtol=1e-6)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("gap", ["learned", "overdue"])
 def test_learned_and_overdue_gaps_do_not_change_the_belief(gap):

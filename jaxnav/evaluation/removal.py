@@ -143,7 +143,7 @@ def control_logits(
       pathways, memory: inputs of the factual decisions, leaves [E, ...].
       episode_keys, step_keys: PRNG keys [E] of the episodes and of their current step; folded further.
     """
-    scene = _direct_value(config, pathways.scene, step_keys, _SCENE_TAG)
+    scene = _direct_value(config, pathways.scene, step_keys, _SCENE_TAG, policy.num_scene_factors)
     goal = _direct_value(config, pathways.goal, step_keys, _GOAL_TAG)
     logits = decide_counterfactually(policy, pathways, memory, scene, goal).logits
 
@@ -156,11 +156,17 @@ def control_logits(
     return jax.lax.switch(config.removed_source, branches)
 
 
-def _direct_value(config: InferenceConfig, pathway: jax.Array, step_keys: jax.Array, tag: int) -> jax.Array:
-    """Value of a direct pathway, float32 [E, ...]: zeros, or the uniform noise of the control."""
+def _direct_value(
+    config: InferenceConfig, pathway: jax.Array, step_keys: jax.Array, tag: int, num_factors: int = 0
+) -> jax.Array:
+    """Value of a direct pathway, float32 [E, ...]: zeros, or the uniform noise of the control.
+
+    The last `num_factors` entries are factors of a stream, which are 1 beside the noise.
+    """
 
     def sample_noise() -> jax.Array:
-        return config.direct_noise * _sample_rows(step_keys, tag, pathway.shape[1:], jax.random.uniform)
+        noise = config.direct_noise * _sample_rows(step_keys, tag, pathway.shape[1:], jax.random.uniform)
+        return noise.at[..., noise.shape[-1] - num_factors :].set(1.0)
 
     # Entries run one by one, so `cond` samples only if needed.
     return jax.lax.cond(config.direct_noise > 0, sample_noise, lambda: jnp.zeros_like(pathway))

@@ -33,6 +33,7 @@ class HandoverPolicy:
     """
 
     has_additive_scores: ClassVar[bool] = False
+    num_scene_factors: ClassVar[int] = 1  # the scene is the factor of the fallback
 
     def __init__(self, experienced: Policy, layout_blind: Policy | None = None) -> None:
         """Pair two policies.

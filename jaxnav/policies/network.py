@@ -223,6 +223,7 @@ class Policy(Stream):
     """Three pathways, fused before one recurrent core; works on single observations and batches."""
 
     num_views: ClassVar[int] = 1  # the scene layer embeds the view once per stream
+    num_scene_factors: ClassVar[int] = 0  # last entries of the scene pathway that are the factor of a stream
     #: True if logits are log probabilities of detection, an exact sum of direct scores and experience; see
     #: `jaxnav.causal.remove_experience`.
     has_additive_scores: ClassVar[bool] = False
@@ -455,6 +456,7 @@ class StreamsPolicy(Policy):
     """
 
     num_views = 2
+    num_scene_factors = 1
 
     def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:
         super().__init__(spec, rngs)

@@ -149,6 +149,8 @@ def test_controls_take_a_part_of_the_counterfactual_decision_from_another_episod
 class ConcatenatingPolicy:
     """A policy whose logits are its pathways: two numbers of scene, two of goal, one of experience."""
 
+    num_scene_factors = 0
+
     def decide(self, pathways, memory):
         logits = jnp.concatenate(pathways[:3], axis=-1)
         return Decision(logits=logits, value=logits[:, 0], hidden=memory.hidden)
@@ -174,6 +176,13 @@ def test_a_random_intervention_sets_scene_and_goal_alone(max_value):
         assert kstest(column / max_value, "uniform").pvalue > 0.01
     assert np.abs(np.corrcoef(result[:, :4].T) - np.eye(4)).max() < 0.15
     np.testing.assert_array_equal(logits()[:, :4], 0.0)
+
+    # The factor of a stream, at the end of the scene, is 1 beside the noise, and 0 where the scene is.
+    policy.num_scene_factors = 1  # pyright: ignore[reportAttributeAccessIssue]
+    with_factor = logits(direct_noise=max_value)
+    np.testing.assert_array_equal(with_factor[:, 1], 1.0)
+    np.testing.assert_array_equal(with_factor[:, [0, 2, 3]], result[:, [0, 2, 3]])
+    np.testing.assert_array_equal(logits()[:, 1], 0.0)
 
 
 @pytest.mark.parametrize("name", ["noise", "random"])
