@@ -93,7 +93,7 @@ def test_a_batch_of_one_run_is_not_the_run_without_its_setting(tmp_path):
         ({"learning_rate": 1e-3}, ("learning_rate", "shape ()", "a list")),
         ({"learning_rate": ["fast", 1e-3]}, ("learning_rate", "'fast'", "a list of numbers")),
         ({"learning_rate": [[1], [1, 2]]}, ("learning_rate", "[[1], [1, 2]]", "a list of numbers")),
-        ({"final_guidance": [None, 0.1]}, ("final_guidance", "nan", "give 0 or more")),
+        ({"final_guidance": [None, 0.1]}, ("final_guidance", "nan", "change the value")),
         ({"learning_rate": [1e-3] * 513}, ("513 runs x 2 seeds", "at most 1,024")),
         ({"learning_rate": []}, ("learning_rate", "shape (0,)", "a list")),
         ({"learning_rate": [1e-3], "entropy": [0.0, 0.1]}, ("different numbers", "learning_rate", "entropy")),

@@ -123,7 +123,7 @@ def test_a_given_weight_is_kept_and_needs_shortest_paths_in_training():
     [
         ({"method": "semexp", "ppo": PPOConfig(guidance=0.1)}, "ppo.guidance is 0.1; method 'semexp' does not choose"),
         ({"ppo": PPOConfig(guidance=-0.1)}, "ppo.guidance is -0.1; give 0 or more"),
-        ({"ppo": PPOConfig(guidance=float("nan"))}, "ppo.guidance is nan; give 0 or more"),
+        ({"ppo": PPOConfig(guidance=float("nan"))}, "ppo.guidance must be float or null, but is nan"),
         ({"ppo": PPOConfig(final_guidance=float("inf"))}, "ppo.final_guidance is inf; give 0 or more"),
     ],
 )
