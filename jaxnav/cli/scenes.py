@@ -194,13 +194,15 @@ def _show(config: ShowConfig, console: Console) -> None:
     require_plotting_packages()
     from jaxnav.viz.scene import draw_scene
 
-    # Pictures of one scene, or of scenes of one name, in different layouts have different names.
+    # Pictures of one scene in different layouts have different names.
     scene = config.select_scene(config.scene, config.index)
-    shift_suffix = f"-shift-{config.shift:g}" if config.shift else ""
-    if config.shift_by != ShowConfig.shift_by:
-        shift_suffix += f"-by-{config.shift_by}"
-    if config.seed != ShowConfig.seed:
-        shift_suffix += f"-seed-{config.seed}"
+    shift_suffix = ""
+    if config.shift:
+        shift_suffix = f"-shift-{config.shift:g}"
+        if config.shift_by != ShowConfig.shift_by:
+            shift_suffix += f"-by-{config.shift_by}"
+        if config.seed != ShowConfig.seed:
+            shift_suffix += f"-seed-{config.seed}"
     path = config.out or Path(re.sub(r"[^\w.-]", "_", scene.name) + shift_suffix + ".png")
     if path.suffix != ".png":
         raise InputError(f"--out {path}: give a name that ends in .png")
