@@ -1,11 +1,13 @@
 """Environments by the name of a world or file."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
 from support.scenes import APARTMENTS, HOUSES, ROOMS, SMALL, draw
 
+from jaxnav.choices import Split
 from jaxnav.env.make import make
 from jaxnav.env.objectnav import OTHER_ROOM
 from jaxnav.env.testing import check_environment
@@ -51,7 +53,8 @@ def test_make_sets_the_documented_step_limits(tmp_path, world, room_types, room_
     write_scenes(path, scenes)
 
     # Training episodes have 100 steps everywhere.
-    for split, expected_limits in (("train", [100] * len(room_types)), ("val", val_limits)):
+    limits: dict[Split, list[int]] = {"train": [100] * len(room_types), "val": val_limits}
+    for split, expected_limits in limits.items():
         env, params = make(world, split, path)
         assert env.task == WORLDS[world].task
         assert params.step_limit.tolist() == expected_limits
@@ -91,13 +94,14 @@ def test_make_shifts_layouts_by_size_or_by_context(tmp_path):
     exchanges = {"size": None, "context": fit_scene_exchange(train_scenes, task)}
     rows_by_kind = {}
     for kind, exchange in exchanges.items():
-        _, params = make("rooms", "val", path, shift=1.0, shift_by=kind)
+        options: dict[str, Any] = {"shift": 1.0, "shift_by": kind}
+        _, params = make("rooms", "val", path, **options)
         bank = compile_bank([exchange_places(scene, task, 1.0, 0, exchange) for scene in val_scenes], task)
         np.testing.assert_array_equal(params.tables.rows, bank.rows)
         rows_by_kind[kind] = bank.rows
     assert not np.array_equal(rows_by_kind["size"], rows_by_kind["context"])
     with pytest.raises(InputError, match=r"^--shift-by 'colour': choose one of size, context"):
-        make("rooms", "val", path, shift=1.0, shift_by="colour")
+        make("rooms", "val", path, shift=1.0, shift_by="colour")  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize(

@@ -36,8 +36,8 @@ CONFIG = RunConfig(
         ({"arms": ("base",)}, "arms"),
         ({"seeds": 2.5}, "seeds"),
         ({"total_steps": 1e6}, "total_steps"),
-        ({"layout": LayoutConfig(setting="Paper")}, "layout.setting"),
-        ({"ppo": PPOConfig(num_envs=64.0)}, "ppo.num_envs"),
+        ({"layout": LayoutConfig(setting="Paper")}, "layout.setting"),  # pyright: ignore[reportArgumentType]
+        ({"ppo": PPOConfig(num_envs=64.0)}, "ppo.num_envs"),  # pyright: ignore[reportArgumentType]
     ],
 )
 def test_settings_of_another_type_are_refused_in_python_too(settings, key):

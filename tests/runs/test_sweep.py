@@ -1,6 +1,7 @@
 """The sweep is the evaluation's rows of sTDE, to the bit, in one compilation."""
 
 import dataclasses
+from typing import Any
 
 import chex
 import jax
@@ -95,8 +96,9 @@ def test_sweep_refuses_impossible_arguments(drawn_run, arguments, problem):
 
 @pytest.mark.parametrize("option", ["decoding", "form", "setting", "split", "world", "shift_by"])
 def test_sweep_refuses_names_that_it_does_not_accept(drawn_run, option):
+    options: dict[str, Any] = {option: "best"}
     with pytest.raises(InputError, match=rf"^--{option.replace('_', '-')} 'best': choose one of "):
-        jaxnav.sweep(drawn_run, EPSILON, **{option: "best"})
+        jaxnav.sweep(drawn_run, EPSILON, **options)
 
 
 def test_sweep_refuses_runs_without_the_layout(drawn_run, tmp_path):
