@@ -311,8 +311,9 @@ def load_scenes(path: str | Path, split: str | None) -> FileScenes:
     # An unknown name of a split is reported before the file is read.
     if split is not None:
         check_choice("--split", split, SPLITS)
-    content = read_bytes(expand_home(path))
-    scenes = parse_scenes(expand_home(path), content)
+    whole_path = expand_home(path)
+    content = read_bytes(whole_path)
+    scenes = parse_scenes(whole_path, content)
     scenes_of_split = tuple(scene for scene in scenes if split in (None, scene.split))
     if not scenes_of_split:
         splits_in_file = sorted({scene.split for scene in scenes})

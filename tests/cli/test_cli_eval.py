@@ -9,6 +9,7 @@ import re
 import shutil
 import tarfile
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -376,6 +377,26 @@ def test_eval_refuses_an_export_of_another_task(run_dir, tmp_path, capsys):
         config["detector"]["false_alarm"] = 0.25
     assert evaluate(copied_run) == 2
     assert "its task differs from that of its run" in refusal(capsys)
+
+
+def test_results_are_written_before_they_are_printed(monkeypatch, tmp_path):
+    """The reader of a pipe may end first, as in `jaxnav eval RUN | head`."""
+
+    class FakeResults:
+        report: ClassVar[dict] = {}
+
+        def write(self, path):
+            path.write_text("written")
+
+    def break_pipe(*_):
+        raise BrokenPipeError
+
+    monkeypatch.setattr("jaxnav.runs.evaluate.evaluate", lambda *_, **__: FakeResults())
+    monkeypatch.setattr("jaxnav.cli.eval._print_report", break_pipe)
+    target = tmp_path / "eval.json"
+    with pytest.raises(BrokenPipeError):
+        evaluate("my:agent", "--json", target)
+    assert target.read_text() == "written"
 
 
 # Finished evaluations
