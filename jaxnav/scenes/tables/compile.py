@@ -138,8 +138,10 @@ def compile_scene(scene: Scene, task: Task) -> Bank:
     views = ego_views(scene, rules, cells, row_format.view)
     best_length = best_lengths(pose_successors(ahead, rules), success)
 
-    # A category is a possible goal if some pose has a path to it; padded to K entries, so that scenes can be joined.
-    goals = np.flatnonzero(best_length.any(axis=0)).astype(np.int32)
+    # A category is a possible goal if every pose has a path to it: with four headings, cells that are only diagonal
+    # neighbours are not connected. Padded to K entries, so that scenes can be joined.
+    is_possible_goal = (best_length > 0).all(axis=0) & (num_poses > 0)
+    goals = np.flatnonzero(is_possible_goal).astype(np.int32)
     return Bank(
         task=task,
         names=(scene.name,),

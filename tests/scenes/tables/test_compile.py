@@ -171,6 +171,20 @@ def test_compile_bank_uses_only_the_goals_of_the_task(rules):
         compile_bank([scene], dataclasses.replace(task, goals=("Fridge",)))
 
 
+@pytest.mark.parametrize("rules", [ROOMS, HOUSES])
+def test_a_possible_goal_can_be_reached_from_every_cell(rules):
+    # Only a diagonal move leads to the last cell. The chair is near that cell and near the row, the book near the row alone.
+    chair = ("Chair", 2.0, 1.0, 0.0, *SMALL)
+    scene = draw(["........#", "########."], chair, ("Book", 0.0, 1.0, 0.0, *SMALL))
+    task = Task(CATEGORIES, rules=dataclasses.replace(rules, success_distance=0.5), detector=PERFECT_DETECTOR)
+    assert compile_bank([scene], task).num_goals.tolist() == [2]
+
+    # With four headings no move is diagonal, so only the chair can be reached from every cell.
+    four_headings = dataclasses.replace(task.rules, headings=4)
+    bank = compile_bank([scene], dataclasses.replace(task, rules=four_headings))
+    assert bank.goals[0, : bank.num_goals[0]].tolist() == [CHAIR]
+
+
 @pytest.mark.parametrize(("rules", "checksum"), [(ROOMS, 0xFA3B430A), (Rules(headings=12), 0x6D3553F4)])
 def test_banks_keep_the_checksums_of_earlier_versions(rules, checksum):
     """By them, earlier runs and benchmarks recognize their scenes. The figures are from before `front_cell`."""
