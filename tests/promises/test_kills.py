@@ -14,10 +14,10 @@ from support.tiny_run import NUM_SEEDS, POLICY_NAMES, write_config
 from jaxnav.store.files import read_log_rows
 
 
-def start(config_file, run_dir, cache, *options):
-    """The command in a process of its own; compiled code is kept, or every start would take its time."""
+def start(config_file, run_dir, *options):
+    """Start the train command in a process of its own, with the compiled programs of the whole suite."""
     command = ["train.py", "--config", config_file, "--run-dir", run_dir, *options]
-    return run(command, JAX_COMPILATION_CACHE_DIR=cache, JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0)
+    return run(command, JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0)
 
 
 def finish(process):
@@ -36,23 +36,22 @@ def latest_checkpoint(run_dir):
 @pytest.mark.timeout(900)
 def test_killed_run_resumes_bit_for_bit(tmp_path):
     config_file = write_config(tmp_path)
-    cache = tmp_path / "cache"
     options = ("--total-steps", "2560", "--validations", "2")  # 20 updates, 10 chunks
     whole_dir = tmp_path / "whole"
     killed_dir = tmp_path / "killed"
-    finish(start(config_file, whole_dir, cache, *options))
+    finish(start(config_file, whole_dir, *options))
 
     # Kill at a random moment: while the process starts, and after the checkpoints of two updates.
     generator = random.Random(0)
     for update in (0, 2, 8):
-        process = start(config_file, killed_dir, cache, *options)
+        process = start(config_file, killed_dir, *options)
         while update and process.poll() is None and latest_checkpoint(killed_dir) < update:
             time.sleep(0.001)
         time.sleep(generator.uniform(0, 0.3) if update else generator.uniform(1, 4))
         process.kill()
         process.communicate()
         assert process.returncode == -signal.SIGKILL
-    assert "resumed after update" in finish(start(config_file, killed_dir, cache, *options))
+    assert "resumed after update" in finish(start(config_file, killed_dir, *options))
 
     file_names = ["metrics.jsonl", "reach.json", *(f"policies/{name}/params.safetensors" for name in POLICY_NAMES)]
     for file_name in file_names:

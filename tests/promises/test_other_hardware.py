@@ -22,11 +22,11 @@ sys.exit(train.main(sys.argv[2:]))
 """
 
 
-def train_on_cores(cores, config_file, run_dir, cache):
+def train_on_cores(cores, config_file, run_dir):
     """Run the train command on some cores, and return what it prints on stderr."""
     core_list = ",".join(map(str, cores))
     command = ["-c", TRAIN_ON_CORES, core_list, "--config", config_file, "--run-dir", run_dir]
-    process = run(command, JAX_COMPILATION_CACHE_DIR=cache, JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0)
+    process = run(command, JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0)
     _, messages = process.communicate()
     assert process.returncode == 0, messages
     return messages
@@ -40,7 +40,7 @@ def test_a_run_of_one_core_is_repeated_on_two(tmp_path):
     cores = sorted(os.sched_getaffinity(0))[:2]
     config_file = write_config(tmp_path)
     run_dir = tmp_path / "run"
-    train_on_cores(cores[:1], config_file, run_dir, tmp_path / "cache")
+    train_on_cores(cores[:1], config_file, run_dir)
 
     # A run of an earlier version has learned the same, but stored it in its exports alone.
     earlier_dir = shutil.copytree(run_dir, tmp_path / "earlier")
@@ -48,12 +48,12 @@ def test_a_run_of_one_core_is_repeated_on_two(tmp_path):
 
     # No file changes but that of the lock, which names the process.
     files_before = contents(run_dir)
-    assert "resumed after update 4 of 4" in train_on_cores(cores, config_file, run_dir, tmp_path / "cache")
+    assert "resumed after update 4 of 4" in train_on_cores(cores, config_file, run_dir)
     files_after = contents(run_dir)
     assert files_after | {".lock": b""} == files_before | {".lock": b""}
 
     # What is learned anew agrees with the exports within the tolerance, and the exports stay.
-    train_on_cores(cores, config_file, earlier_dir, tmp_path / "cache")
+    train_on_cores(cores, config_file, earlier_dir)
     for name in POLICY_NAMES:
         export_file = f"policies/{name}/params.safetensors"
         assert (earlier_dir / export_file).read_bytes() == files_before[export_file]
