@@ -26,9 +26,9 @@ from _common import print_report
 
 from jaxnav.baselines.layout_model import (
     LayoutModel,
-    SearchSnapshot,
+    PlannerSnapshot,
     detection_counts,
-    detection_rates,
+    estimate_detection_rates,
     fit_layout_model,
     uniform_layout_model,
 )
@@ -206,7 +206,7 @@ def fit_priors(training_world: SearchWorld) -> FittedPriors:
     counts = np.stack([detection_counts(planner_scene.sites) for planner_scene in training_world.planner_scenes])
     rates = []
     for fold in range(NUM_FOLDS):
-        rates.append(detection_rates(counts[training_world.fold != fold].sum(axis=0)))
+        rates.append(estimate_detection_rates(counts[training_world.fold != fold].sum(axis=0)))
 
     # Searches with a flat belief give the snapshots to which the models of the other folds are fitted.
     uniform_models = [uniform_layout_model(len(training_world.bank.task.categories))] * NUM_FOLDS
@@ -296,7 +296,7 @@ def run_searches(
     return results
 
 
-def information_gain(model: LayoutModel, rates: np.ndarray, snapshot: SearchSnapshot) -> float:
+def information_gain(model: LayoutModel, rates: np.ndarray, snapshot: PlannerSnapshot) -> float:
     """Return the bits of information about a goal's sites that a model has beyond the flat belief.
 
     The mean is over the categories that have not been detected; 0 if there are none.

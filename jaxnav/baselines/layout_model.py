@@ -5,8 +5,8 @@ are the surroundings of the site, and f is 1 if category j was detected at a sit
 softmax over the sites.
 
 `fit_layout_model` fits W and b to snapshots of searches by conditional likelihood: together with the looks in vain so
-far, the prior should predict the sites of the goals. `detection_counts` and `detection_rates` measure how often a look
-at an object detects it.
+far, the prior should predict the sites of the goals. `detection_counts` and `estimate_detection_rates` measure how
+often a look at an object detects it.
 
 Symbols in shapes: K categories, N sites, L kinds of looks, G snapshots.
 """
@@ -49,7 +49,7 @@ class LayoutModel(NamedTuple):
         return relation_scores + self.surrounding_weights[goal] @ sites.surroundings
 
 
-class SearchSnapshot(NamedTuple):
+class PlannerSnapshot(NamedTuple):
     """Knowledge of a searcher at one time.
 
     Attributes:
@@ -74,13 +74,13 @@ def uniform_layout_model(num_categories: int) -> LayoutModel:
 
 
 def fit_layout_model(
-    snapshots: Sequence[SearchSnapshot], rates: np.ndarray, *, use_relations: bool = True
+    snapshots: Sequence[PlannerSnapshot], rates: np.ndarray, *, use_relations: bool = True
 ) -> LayoutModel:
     """Fit the model to the sites of the goals.
 
     Args:
       snapshots: snapshots of searches in training scenes.
-      rates: float32 [K, L], see `detection_rates`.
+      rates: float32 [K, L], see `estimate_detection_rates`.
       use_relations: False for a model without categories: all goals share the weights of the surroundings, and
         detections have no effect.
     """
@@ -134,7 +134,7 @@ class _SnapshotBatch(NamedTuple):
     is_site: jax.Array
 
 
-def _batch_snapshots(snapshots: Sequence[SearchSnapshot]) -> _SnapshotBatch:
+def _batch_snapshots(snapshots: Sequence[PlannerSnapshot]) -> _SnapshotBatch:
     """Stack snapshots of scenes with different numbers of sites."""
     max_sites = max(snapshot.features.shape[-1] for snapshot in snapshots)
 
@@ -225,7 +225,7 @@ def detection_counts(sites: Sites) -> np.ndarray:
     return counts
 
 
-def detection_rates(counts: np.ndarray) -> np.ndarray:
+def estimate_detection_rates(counts: np.ndarray) -> np.ndarray:
     """Return the probability that a look at an object detects it.
 
     Args:

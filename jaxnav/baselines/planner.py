@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxnav.baselines.layout_model import LayoutModel, SearchSnapshot
+from jaxnav.baselines.layout_model import LayoutModel, PlannerSnapshot
 from jaxnav.baselines.sites import NUM_RELATIONS, Sites
 from jaxnav.scenes.task import DONE
 
@@ -41,7 +41,7 @@ class SearchResult(NamedTuple):
 
     length: int
     success: bool
-    snapshots: list[SearchSnapshot]
+    snapshots: list[PlannerSnapshot]
 
 
 def search_for_goal(
@@ -51,7 +51,7 @@ def search_for_goal(
 
     Args:
       scene: the scene.
-      rates: float32 [K, L], see `detection_rates`.
+      rates: float32 [K, L], see `estimate_detection_rates`.
       model: the prior.
       goal: index of the category.
       pose: start of the search.
@@ -94,7 +94,7 @@ def search_for_goal(
                     scores = model.scores(goal, features, sites)
                     path = []
         if time & (time + 1) == 0:
-            snapshots.append(SearchSnapshot(sites, features.copy(), look_counts.copy(), detected.copy()))
+            snapshots.append(PlannerSnapshot(sites, features.copy(), look_counts.copy(), detected.copy()))
 
         # Plan towards the pose with the best chance to detect the goal, unless a path is left to walk.
         if not path:

@@ -35,7 +35,7 @@ from jaxnav.report.charts import (
 from jaxnav.report.config import ReportConfig
 from jaxnav.report.headline import make_headline
 from jaxnav.report.measure import ShiftMeasurements, measure_shift
-from jaxnav.report.page import Section, render_page, to_text_table
+from jaxnav.report.page import Section, render_report_page, to_text_table
 from jaxnav.report.replays import TrainedLayout
 from jaxnav.runs.run import Run
 
@@ -117,7 +117,7 @@ def make_report(run: Run, reference_run: Run | None, config: ReportConfig, conso
             accounts[shift] = measurements.account
         headline = make_headline(reports, accounts, config.threshold)
         sections = make_sections(run, by_shift, config.threshold)
-        return render_page(page_title, headline, run_facts, sections, replays_by_shift)
+        return render_report_page(page_title, headline, run_facts, sections, replays_by_shift)
 
 
 def measure_shifts(

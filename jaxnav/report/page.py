@@ -1,7 +1,7 @@
 """The report's page: sections of text, tables and charts, and replays, as one self-contained HTML file.
 
-`render_page` renders the page from a `Headline`, from `Section`s, which hold `TextTable`s and `Chart`s, and from the
-data of the replays. Terms of the glossary open their definitions where they stand, see `jaxnav.report.terms`.
+`render_report_page` renders the page from a `Headline`, from `Section`s, which hold `TextTable`s and `Chart`s, and from
+the data of the replays. Terms of the glossary open their definitions where they stand, see `jaxnav.report.terms`.
 The page's layout, style and scripts are the files next to this module.
 """
 
@@ -83,7 +83,7 @@ def to_text_table(title: str, table: ConsoleTable) -> TextTable:
     return TextTable(title, tuple(column_headers), tuple(table_rows))
 
 
-def render_page(
+def render_report_page(
     title: str,
     headline: Headline,
     facts: Mapping[str, str],

@@ -37,9 +37,9 @@ class Rules:
     """Rules of motion, view and success.
 
     Attributes:
-      headings: H; heading h looks 360 h / H degrees clockwise from +z. With fewer than 8, some of the eight moves do not
-        exist, and only goals that can be reached from every cell are sought.
-      horizons: camera pitches, degrees downwards; every episode starts with the first.
+      headings: H; heading h looks 360 h / H degrees clockwise from +z. With fewer than 8, some of the eight moves are
+        missing, and only goals that can be reached from every cell are sought.
+      horizons: camera pitches, degrees downwards; training episodes start with the first.
       field_of_view: horizontal and vertical, degrees.
       camera: height above the floor, metres.
       front_cell: cell that the middle of the view's row 1 shows. `move`: the cell that MoveAhead leads to, so that the

@@ -6,9 +6,9 @@ from support.scenes import BOOK, CHAIR, SMALL, draw
 from support.sites import find_perfect_sites
 
 from jaxnav.baselines.layout_model import (
-    SearchSnapshot,
+    PlannerSnapshot,
     detection_counts,
-    detection_rates,
+    estimate_detection_rates,
     fit_layout_model,
     uniform_layout_model,
 )
@@ -37,7 +37,7 @@ def make_snapshot(goal_site, clue_sites, num_looks=(0, 0), standable=(0, 0)):
     surroundings[0] = standable
     relations = np.zeros((3, num_sites, num_sites), bool)
     sites = Sites(None, np.zeros((0, 2)), object_sites, relations, surroundings)  # pyright: ignore[reportArgumentType]
-    return SearchSnapshot(sites, features, np.array([num_looks], np.uint16), np.zeros(2, bool))
+    return PlannerSnapshot(sites, features, np.array([num_looks], np.uint16), np.zeros(2, bool))
 
 
 def snapshots_with_goal(is_second_site, clue_sites, num_snapshots=56, **options):
@@ -59,7 +59,7 @@ def test_detection_rates_shrink_towards_the_mean_as_worked_out():
     # Three of four looks hit in one way, none of none in the other. The means are 3.5 / 5 and 0.5 / 1; each counts for
     # two looks: (3 + 1.4) / 6 and (0 + 1) / 2.
     look_counts = np.array([[[4, 0]], [[3, 0]]])
-    np.testing.assert_allclose(detection_rates(look_counts), [[4.4 / 6, 0.5]], rtol=1e-6)
+    np.testing.assert_allclose(estimate_detection_rates(look_counts), [[4.4 / 6, 0.5]], rtol=1e-6)
 
 
 def test_detection_counts_of_a_single_cell():

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.scenes import APARTMENTS, BOOK, CATEGORIES, CHAIR, FRIDGE, ROOMS, SMALL, coarse_scene, draw, maze_scene
 
-from jaxnav.baselines.layout_model import detection_counts, detection_rates, uniform_layout_model
+from jaxnav.baselines.layout_model import detection_counts, estimate_detection_rates, uniform_layout_model
 from jaxnav.baselines.planner import PlannerScene, search_for_goal, shortest_paths
 from jaxnav.baselines.sites import find_sites
 from jaxnav.scenes.lattice import best_lengths, pose_successors
@@ -33,7 +33,12 @@ def planner_scene(scene, rules=ROOMS):
 def plan_search(planned_scene, start_pose, goal=BOOK, model=FLAT, step_limit=200):
     """Search of the planner from a pose, with detection rates counted in the scene itself."""
     return search_for_goal(
-        planned_scene, detection_rates(detection_counts(planned_scene.sites)), model, goal, start_pose, step_limit
+        planned_scene,
+        estimate_detection_rates(detection_counts(planned_scene.sites)),
+        model,
+        goal,
+        start_pose,
+        step_limit,
     )
 
 
@@ -89,7 +94,7 @@ def test_planner_uses_nothing_it_has_not_detected(seed, rules):
     # Neither the places of objects nor, before a detection, the distance to success changes the search.
     planned_scene = planner_scene(maze_scene(seed), rules)
     sites = planned_scene.sites
-    rates = detection_rates(detection_counts(sites))
+    rates = estimate_detection_rates(detection_counts(sites))
     hidden_length = np.where(sites.detected_site >= 0, planned_scene.best_length, 7)
     altered = planned_scene._replace(sites=sites._replace(object_sites=~sites.object_sites), best_length=hidden_length)
     for goal in range(len(CATEGORIES)):

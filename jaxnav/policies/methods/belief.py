@@ -10,9 +10,9 @@ squares C(t) around a target t, its score is the log of the probability of detec
 
     score(t) = log P(C(t)) - log(actions to t)         P(c) ~ exp(score of c) * P(looks so far miss a goal in c)
 
-Scores are a sum, so eq. 1 is exact. *Direct* is the score under `Places`, which sees floor, walls and unexplored space
-and is alike for all categories; looks in vain belong to it. *Experience* is what a `Predictor` adds by the categories
-seen so far: the score under its belief less the direct score. Removing experience leaves the agent that knows places
+Scores are a sum, so eq. 1 is exact. *Direct* is `DirectScore`, which sees floor, walls and unexplored space and is
+alike for all categories; looks in vain belong to it. *Experience* is what a `Predictor` adds by the categories seen so
+far: the score under its belief less the direct score. Removing experience leaves the agent that knows places
 alone, bit for bit.
 
 Predictors:
@@ -180,7 +180,7 @@ class FloorPerceptron(nnx.Module):
         return by_hidden + jnp.tensordot(self.linear_kernel[...][output], features, 1)
 
 
-class Places(nnx.Module):
+class DirectScore(nnx.Module):
     """Where things are: the score of a square by floor, walls and unexplored space, alike for all categories.
 
     Attributes:
@@ -214,7 +214,7 @@ class Predictor(Experience):
           weights: float32 [K], the goal's column of w (eq. 7).
 
         Returns:
-          float32 [n, n], log odds that are added to those of `Places`.
+          float32 [n, n], log odds that are added to those of `DirectScore`.
         """
         raise NotImplementedError
 
@@ -302,7 +302,7 @@ class TargetPolicy(Policy):
         self.adaptation = None
         predictor_class = spec.method.experience
         self.method = predictor_class(spec, rngs)
-        self.places = Places(rngs)
+        self.places = DirectScore(rngs)
         self.detection_rates = nnx.Param(jnp.zeros((spec.num_categories, NUM_LOOK_DISTANCES)))
         self.hidden_logit = nnx.Param(jnp.float32(_INITIAL_HIDDEN_LOGIT))
 

@@ -173,7 +173,7 @@ def test_compile_bank_uses_only_the_goals_of_the_task(rules):
 
 @pytest.mark.parametrize("rules", [ROOMS, HOUSES])
 def test_a_possible_goal_can_be_reached_from_every_cell(rules):
-    # Only a diagonal move leads to the last cell. The chair is near that cell and near the row, the book near the row alone.
+    # Only a diagonal move leads to the last cell. The chair is near it and near the row, the book near the row alone.
     chair = ("Chair", 2.0, 1.0, 0.0, *SMALL)
     scene = draw(["........#", "########."], chair, ("Book", 0.0, 1.0, 0.0, *SMALL))
     task = Task(CATEGORIES, rules=dataclasses.replace(rules, success_distance=0.5), detector=PERFECT_DETECTOR)
