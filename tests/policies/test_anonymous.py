@@ -1,4 +1,4 @@
-"""The anonymous agent knows the view and the goal's detection, and nothing else."""
+"""The anonymous agent: decisions depend on the view and the goal's detection, and on no category."""
 
 import dataclasses
 import functools
@@ -18,13 +18,16 @@ from jaxnav.policies.pathways import PolicyInputs
 from jaxnav.scenes.tables.observation_row import RowFormat
 
 ROW_FORMAT = RowFormat(3)
-BOOK_SEEN, CHAIR_SEEN, NOTHING = (204, 102, 128, 38), (150, 51, 140, 60), (0, 0, 0, 0)
+#: Bytes of detections: confidence, ahead, right and size.
+BOOK_DETECTION = (204, 102, 128, 38)
+CHAIR_DETECTION = (150, 51, 140, 60)
+NO_DETECTION = (0, 0, 0, 0)
 
 
 @functools.cache
-def deciding(method):
-    """Return a compiled first decision of a lively policy."""
-    spec = dataclasses.replace(tiny.SPEC, method=find_method(method), method_sizes=())
+def compile_decision(method_name):
+    """Compiled first decision of a policy with random parameters."""
+    spec = dataclasses.replace(tiny.SPEC, method=find_method(method_name), method_sizes=())
     policy = bind(spec, tiny.random_params(0, spec))
 
     @jax.jit
@@ -34,48 +37,58 @@ def deciding(method):
     return decide
 
 
-def logits(method, detections, goal, view=0):
-    cells = np.full((1, 11, 11), view, np.uint8)
-    row = ROW_FORMAT.pack(np.array([detections], np.uint8), cells)[0]
-    return deciding(method)(Observation(row=jnp.asarray(row), goal=jnp.int32(goal)))
+def first_logits(method_name, detections, goal, view_code=0):
+    """Logits for the detections of book, chair and fridge; all cells of the view have one code."""
+    view = np.full((1, 11, 11), view_code, np.uint8)
+    row = ROW_FORMAT.pack(np.array([detections], np.uint8), view)[0]
+    return compile_decision(method_name)(Observation(row=jnp.asarray(row), goal=jnp.int32(goal)))
 
 
-def test_which_goal_it_is_does_not_matter():
-    """The same detection, of the book or of the chair as the goal, gives the same bits."""
-    book = logits("anonymous", [BOOK_SEEN, NOTHING, NOTHING], BOOK)
-    chair = logits("anonymous", [NOTHING, BOOK_SEEN, NOTHING], CHAIR)
-    np.testing.assert_array_equal(book, chair)
-    np.testing.assert_array_equal(logits("anonymous", [NOTHING] * 3, FRIDGE), logits("anonymous", [NOTHING] * 3, BOOK))
+def test_category_of_the_goal_does_not_matter():
+    """Equal detections, of the book or of the chair as the goal, give bit-identical logits."""
+    book_logits = first_logits("anonymous", [BOOK_DETECTION, NO_DETECTION, NO_DETECTION], BOOK)
+    chair_logits = first_logits("anonymous", [NO_DETECTION, BOOK_DETECTION, NO_DETECTION], CHAIR)
+    np.testing.assert_array_equal(book_logits, chair_logits)
+
+    # Undetected goals.
+    fridge_logits = first_logits("anonymous", [NO_DETECTION] * 3, FRIDGE)
+    np.testing.assert_array_equal(fridge_logits, first_logits("anonymous", [NO_DETECTION] * 3, BOOK))
 
 
-def test_what_else_is_detected_does_not_matter():
-    alone = logits("anonymous", [BOOK_SEEN, NOTHING, NOTHING], BOOK)
-    among = logits("anonymous", [BOOK_SEEN, CHAIR_SEEN, CHAIR_SEEN], BOOK)
-    np.testing.assert_array_equal(alone, among)
+def test_detections_of_other_categories_do_not_matter():
+    logits = first_logits("anonymous", [BOOK_DETECTION, NO_DETECTION, NO_DETECTION], BOOK)
+    logits_with_others = first_logits("anonymous", [BOOK_DETECTION, CHAIR_DETECTION, CHAIR_DETECTION], BOOK)
+    np.testing.assert_array_equal(logits, logits_with_others)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["rgb", "org"])
-def test_for_other_agents_both_matter(method):
+def test_goal_category_and_other_detections_matter_to_other_agents(method):
     """The negative control."""
-    book = logits(method, [BOOK_SEEN, NOTHING, NOTHING], BOOK)
-    assert np.abs(book - logits(method, [NOTHING, BOOK_SEEN, NOTHING], CHAIR)).max() > 1e-3
-    assert np.abs(book - logits(method, [BOOK_SEEN, CHAIR_SEEN, NOTHING], BOOK)).max() > 1e-3
+    logits = first_logits(method, [BOOK_DETECTION, NO_DETECTION, NO_DETECTION], BOOK)
+    chair_logits = first_logits(method, [NO_DETECTION, BOOK_DETECTION, NO_DETECTION], CHAIR)
+    logits_with_chair = first_logits(method, [BOOK_DETECTION, CHAIR_DETECTION, NO_DETECTION], BOOK)
+    assert np.abs(logits - chair_logits).max() > 1e-3
+    assert np.abs(logits - logits_with_chair).max() > 1e-3
 
 
-def test_the_view_and_the_goals_detection_do_matter():
-    seen = logits("anonymous", [BOOK_SEEN, NOTHING, NOTHING], BOOK)
-    assert np.abs(seen - logits("anonymous", [NOTHING] * 3, BOOK)).max() > 1e-3
-    assert np.abs(seen - logits("anonymous", [CHAIR_SEEN, NOTHING, NOTHING], BOOK)).max() > 1e-3
-    assert np.abs(seen - logits("anonymous", [BOOK_SEEN, NOTHING, NOTHING], BOOK, view=1)).max() > 1e-3
+def test_view_and_detection_of_the_goal_matter():
+    detections = [BOOK_DETECTION, NO_DETECTION, NO_DETECTION]
+    logits = first_logits("anonymous", detections, BOOK)
+    undetected_logits = first_logits("anonymous", [NO_DETECTION] * 3, BOOK)
+    other_detection_logits = first_logits("anonymous", [CHAIR_DETECTION, NO_DETECTION, NO_DETECTION], BOOK)
+    other_view_logits = first_logits("anonymous", detections, BOOK, view_code=1)
+    assert np.abs(logits - undetected_logits).max() > 1e-3
+    assert np.abs(logits - other_detection_logits).max() > 1e-3
+    assert np.abs(logits - other_view_logits).max() > 1e-3
 
 
-def test_its_networks_have_one_category():
+def test_networks_of_the_anonymous_agent_have_one_category():
     spec = dataclasses.replace(tiny.SPEC, method=find_method("anonymous"), method_sizes=())
     params = tiny.random_params(0, spec)
     chex.assert_shape(params["appearance"]["embedding"], (1, tiny.SIZES.appearance))
     chex.assert_shape(params["sought"]["embedding"], (1, tiny.SIZES.appearance))
     assert "method" not in params
-    assert sum(leaf.size for leaf in jax.tree.leaves(params)) < sum(
-        leaf.size for leaf in jax.tree.leaves(tiny.random_params(0))
-    )
+    num_params = sum(leaf.size for leaf in jax.tree.leaves(params))
+    num_org_params = sum(leaf.size for leaf in jax.tree.leaves(tiny.random_params(0)))
+    assert num_params < num_org_params

@@ -1,4 +1,4 @@
-"""Belief: looks, squares and scores against NumPy twins, exact removal, the fit, and refusals."""
+"""Belief: looks, squares and scores against NumPy twins, exact removal, the fit, and homes that are refused."""
 
 import dataclasses
 import functools
@@ -82,7 +82,7 @@ def make_knowledge():
 
 
 def random_cells(rng, size=2 * NUM_SQUARES):
-    """A map with every bit at random."""
+    """A map on which every bit is drawn at random."""
     words = np.zeros((size, size), np.uint32)
     for bit in (1 << BOOK, 1 << CHAIR, 1 << FRIDGE, int(EXPLORED_BIT), int(FREE_BIT), int(WALL_BIT)):
         words |= np.where(rng.random((size, size)) < 0.1, np.uint32(bit), np.uint32(0))
@@ -90,7 +90,7 @@ def random_cells(rng, size=2 * NUM_SQUARES):
 
 
 def random_policy_params(method=BELIEF, seed=0):
-    """Parameters that score by all of their inputs."""
+    """Random parameters, so that scores depend on all inputs."""
     rng = np.random.default_rng(seed)
     params = init_params(SPECS[method], jax.random.key(seed))
     params = jax.tree.map(lambda leaf: leaf + jnp.asarray(rng.normal(size=leaf.shape), jnp.float32), params)
@@ -130,19 +130,23 @@ def test_features_of_a_square_are_those_of_a_twin():
     features = np.asarray(floor_features(jnp.asarray(floor)))
     scores = np.asarray(relation_scores(nearby_categories(jnp.asarray(categories)), jnp.asarray(weights)))
     for row, column in ((0, 0), (3, 19), (10, 7), (19, 19)):
-        own = floor[:, row, column]
-        means = [floor[(slice(None), *neighbours(row, column, radius))].mean(axis=(1, 2)) for radius in (1, 3)]
-        np.testing.assert_allclose(features[:, row, column], np.concatenate([own, *means]), rtol=1e-5)
+        # Floor shares of the square itself, and their means within 1 and 3 squares.
+        expected_features = [floor[:, row, column]]
+        for radius in (1, 3):
+            expected_features.append(floor[(slice(None), *neighbours(row, column, radius))].mean(axis=(1, 2)))
+        np.testing.assert_allclose(features[:, row, column], np.concatenate(expected_features), rtol=1e-5)
 
         # A category counts once within each radius in which it was seen.
-        expected = 0.0
+        expected_score = 0.0
         for radius, radius_weights in zip(RADII, weights, strict=True):
-            seen = np.bitwise_or.reduce(categories[neighbours(row, column, radius)], axis=None)
-            expected += sum(radius_weights[k] for k in range(NUM_CATEGORIES) if seen >> k & 1)
-        np.testing.assert_allclose(scores[row, column], expected, rtol=1e-4, atol=1e-5)
+            category_bits = np.bitwise_or.reduce(categories[neighbours(row, column, radius)], axis=None)
+            for category in range(NUM_CATEGORIES):
+                if category_bits >> category & 1:
+                    expected_score += radius_weights[category]
+        np.testing.assert_allclose(scores[row, column], expected_score, rtol=1e-4, atol=1e-5)
 
 
-def test_looks_in_vain_follow_worked_arithmetic():
+def test_missed_looks_follow_worked_arithmetic():
     # Two looks with rate 1/2 and one with rate 1/4 miss with (1/2)^2 x 3/4 = 3/16, unless hidden (odds 1: half).
     look_counts = jnp.zeros((NUM_LOOK_DISTANCES, 1, 2)).at[0, 0, 0].set(2.0).at[1, 0, 0].set(1.0)
     rates = jnp.zeros(NUM_LOOK_DISTANCES).at[0].set(0.5).at[1].set(0.25)
@@ -152,7 +156,7 @@ def test_looks_in_vain_follow_worked_arithmetic():
     np.testing.assert_allclose(np.exp(never_hidden), [[3 / 16, 1.0]], rtol=1e-6)
 
 
-def test_a_view_looks_at_its_squares_from_the_nearest_cell():
+def test_view_looks_at_its_squares_from_the_nearest_cell():
     """Heading north from cell (8, 8): cells 1 and 2 ahead are seen, 3 ahead is hidden, 4 ahead is blocked and seen."""
     view = np.full((1, ROWS.view, ROWS.view), VIEW_UNKNOWN, np.uint8)
     view[0, [1, 2, 4], ROWS.view // 2] = VIEW_FREE, VIEW_FREE, VIEW_BLOCKED
@@ -167,7 +171,7 @@ def test_a_view_looks_at_its_squares_from_the_nearest_cell():
 # Targets
 
 
-def test_target_scores_are_the_log_of_the_probability_around_a_target_per_action():
+def test_target_score_is_the_log_of_the_nearby_probability_per_action():
     rng = np.random.default_rng(2)
     log_belief = rng.normal(size=(NUM_SQUARES, NUM_SQUARES)).astype(np.float32)
     log_cost = rng.random((NUM_SQUARES, NUM_SQUARES)).astype(np.float32)
@@ -179,7 +183,7 @@ def test_target_scores_are_the_log_of_the_probability_around_a_target_per_action
 
 
 @pytest.mark.slow
-def test_only_unexplored_squares_that_can_be_reached_are_targets():
+def test_only_reachable_unexplored_squares_are_targets():
     """A closed chamber of 6 x 6 cells around the agent, in which one cell is unexplored."""
     cells = np.zeros((32, 32), np.uint32)
     cells[9:17, 9:17] = WALL_BIT | EXPLORED_BIT
@@ -204,18 +208,21 @@ def test_box_sums_wrap_around():
 
 @functools.cache
 def make_agent(num_episodes=4):
-    """Agents of the tiny world at the start, with policy inputs on whose maps every category is somewhere."""
+    """Agents at the start of episodes in the tiny world, and policy inputs whose maps hold marks of all categories."""
     agent_loop = AgentLoop(ENV, SPECS[BELIEF], tiny.ESTIMATOR)
     knowledge = make_knowledge()
     memory = agent_loop.bind(random_policy_params()).initial_memory((num_episodes,))
     agent = jax.jit(lambda: agent_loop.start(jax.random.key(0), num_episodes, memory, knowledge, PARAMS))()
     inputs = jax.jit(lambda agent: agent_loop.policy_inputs(agent, knowledge, PARAMS))(agent)
-    seen_bits = random_cells(np.random.default_rng(6), MAP_CELLS) & np.uint32((1 << NUM_CATEGORIES) - 1)
-    cells = inputs.reading.cells | jnp.asarray(seen_bits)[None]
+
+    # Add random categories to the maps.
+    category_bits = random_cells(np.random.default_rng(6), MAP_CELLS) & np.uint32((1 << NUM_CATEGORIES) - 1)
+    cells = inputs.reading.cells | jnp.asarray(category_bits)[None]
     return agent, inputs._replace(reading=inputs.reading._replace(cells=cells))
 
 
 def score_pathways(method, params):
+    """Pathways of the agents, their factual logits, and their counterfactual logits."""
     agent, inputs = make_agent()
 
     @jax.jit
@@ -231,39 +238,42 @@ def score_pathways(method, params):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", [BELIEF, DIRICHLET], ids=["loglinear", "dirichlet"])
-def test_equation_1_is_the_search_by_places_bit_for_bit(method):
+def test_equation_1_leaves_the_search_by_places_bit_for_bit(method):
     params = random_policy_params(method)
     pathways, logits, counterfactual = score_pathways(method, params)
     assert logits.shape == (4, MAP_SQUARES**2)
     assert (np.asarray(pathways.scene) > NO_TARGET_SCORE).sum(axis=1).min() > 100
     assert np.abs(counterfactual).max() > 0.1  # there is experience to remove
 
-    # The same policy whose predictor adds nothing.
-    blind_params = params | {"method": jax.tree.map(jnp.zeros_like, params["method"])}
-    _, places_logits, no_experience = score_pathways(method, blind_params)
+    # A policy whose predictor adds nothing searches by places.
+    places_params = params | {"method": jax.tree.map(jnp.zeros_like, params["method"])}
+    _, places_logits, places_counterfactual = score_pathways(method, places_params)
     np.testing.assert_array_equal(tde(logits, counterfactual), places_logits)
-    np.testing.assert_array_equal(no_experience, np.zeros_like(no_experience))
+    np.testing.assert_array_equal(places_counterfactual, np.zeros_like(places_counterfactual))
+
+
+def paper_config(epsilon):
+    """Inference by sTDE in its paper form."""
+    grid = inference_grid([table_row("stde", epsilon, "paper", "argmax")], ("layout",), 1)
+    return jax.tree.map(lambda leaf: leaf[0], grid)
 
 
 @pytest.mark.slow
 def test_removal_from_target_scores_is_equation_2_in_its_paper_form():
+    # Compare the logits of targets; squares that are no target have a score far below.
     _, logits, counterfactual = score_pathways(BELIEF, random_policy_params())
+    is_target = np.asarray(logits) > NO_TARGET_SCORE / 2
     gap = jnp.array([0.0, 0.3, 0.9, 1.0])
     for epsilon in (0.0, 0.25, 1.0):
-        grid = inference_grid([table_row("stde", epsilon, "paper", "argmax")], ("layout",), 1)
-        config = jax.tree.map(lambda leaf: leaf[0], grid)
-        removed, _ = apply_removal(config, logits, counterfactual, gap, has_additive_scores=True)
+        result, _ = apply_removal(paper_config(epsilon), logits, counterfactual, gap, has_additive_scores=True)
         expected = stde(logits, counterfactual, gap, epsilon, "paper")
-        is_target = np.asarray(logits) > NO_TARGET_SCORE / 2
-        np.testing.assert_allclose(np.asarray(removed)[is_target], np.asarray(expected)[is_target], atol=1e-5)
+        np.testing.assert_allclose(np.asarray(result)[is_target], np.asarray(expected)[is_target], atol=1e-5)
         if epsilon >= 1:
-            np.testing.assert_array_equal(removed, logits)
+            np.testing.assert_array_equal(result, logits)
+
     # A gap of 1 with epsilon 0 removes everything.
-    grid = inference_grid([table_row("stde", 0.0, "paper", "argmax")], ("layout",), 1)
-    removed, weight = apply_removal(
-        jax.tree.map(lambda leaf: leaf[0], grid), logits, counterfactual, gap, has_additive_scores=True
-    )
-    np.testing.assert_array_equal(removed[3], tde(logits, counterfactual)[3])
+    result, weight = apply_removal(paper_config(0.0), logits, counterfactual, gap, has_additive_scores=True)
+    np.testing.assert_array_equal(result[3], tde(logits, counterfactual)[3])
     np.testing.assert_array_equal(weight, gap)
 
 
@@ -273,14 +283,16 @@ def test_mixture_form_scores_targets_by_the_mixture_of_beliefs():
     log_places, log_layout, log_cost = rng.normal(size=(3, MAP_SQUARES, MAP_SQUARES)).astype(np.float32)
     places_scores = score_targets(jnp.asarray(log_places), jnp.asarray(log_cost))
     layout_scores = score_targets(jnp.asarray(log_layout), jnp.asarray(log_cost))
+    experience = layout_scores - places_scores
+
+    # Mix the normalised beliefs and score the mixture.
+    places_belief = np.exp(log_places) / np.exp(log_places).sum()
+    layout_belief = np.exp(log_layout) / np.exp(log_layout).sum()
     for gap in (0.0, 0.3, 1.0):
-        places_belief = np.exp(log_places) / np.exp(log_places).sum()
-        layout_belief = np.exp(log_layout) / np.exp(log_layout).sum()
         mixed_belief = (1 - gap) * layout_belief + gap * places_belief
         expected = score_targets(jnp.log(jnp.asarray(mixed_belief)), jnp.asarray(log_cost))
-        experience = layout_scores - places_scores
-        mixed = remove_from_sum(places_scores, experience, jnp.full(MAP_SQUARES, gap), 0.0, "mixture")
-        np.testing.assert_allclose(mixed, expected, atol=1e-4)
+        mixed_scores = remove_from_sum(places_scores, experience, jnp.full(MAP_SQUARES, gap), 0.0, "mixture")
+        np.testing.assert_allclose(mixed_scores, expected, atol=1e-4)
 
 
 @pytest.mark.slow
@@ -304,8 +316,9 @@ def test_dirichlet_spreads_the_log_of_the_relative_weights():
     def score_squares(params):
         return bind(SPECS[DIRICHLET], params).method.score_squares(squares, jnp.int32(BOOK), weights)  # type: ignore
 
+    # Every radius within which the chair lies adds its weight times log(0.2 / 0.4): all radii in square (10, 10), 4
+    # and 8 squares in square (10, 13), and none in square (10, 19).
     scores = np.asarray(score_squares(params))
-    # Square (10, 10) is within all radii, square (10, 13) within 4 and 8 squares, square (10, 19) within none.
     np.testing.assert_allclose(scores[10, 10], 1.875 * np.log(0.5), rtol=1e-5)
     np.testing.assert_allclose(scores[10, 13], 0.375 * np.log(0.5), rtol=1e-5)
     assert scores[10, 19] == 0.0
@@ -331,7 +344,7 @@ def test_contract_of_methods_holds(name):
 
 
 def test_objects_of_a_home_are_where_its_detector_reports_them():
-    """A corridor along z with a book in its last cell, 23 cells from the first."""
+    """In a corridor along z, a book is in the last cell, 23 cells from the first."""
     bank = compile_bank([corridor_scene(24)], Task(CATEGORIES, detector=PERFECT_DETECTOR))
     home_objects = locate_objects(bank)
     np.testing.assert_array_equal(home_objects.categories, [[BOOK]])
@@ -345,7 +358,8 @@ def test_rates_are_hits_per_look_and_rare_categories_have_the_mean_rate():
     look_counts[0, 0] = 98.0
     hits[0, 0] = 73.5
     rates = np.asarray(detection_rates(LookCounts(jnp.asarray(look_counts), jnp.asarray(hits))))
-    # Mean 74 / 99; with two looks at it, (73.5 + 2 x 74 / 99) / 100, and the mean itself for the category never seen.
+    # The mean is 74 / 99. Two looks with the mean rate are added to the 98 looks, (73.5 + 2 x 74 / 99) / 100, and a
+    # category without looks has the mean itself.
     np.testing.assert_allclose(rates[:, 0], [(73.5 + 148 / 99) / 100, 74 / 99], rtol=1e-5)
     np.testing.assert_allclose(rates[:, 1], [0.5, 0.5], rtol=1e-5)
 
@@ -353,12 +367,17 @@ def test_rates_are_hits_per_look_and_rare_categories_have_the_mean_rate():
 @pytest.mark.slow
 def test_looks_at_an_object_are_counted_by_distance_and_hit_where_it_is_detected():
     """Looking north in a corridor at a book 4 cells ahead: a look from 1 m, and a hit."""
+    # The agent is in cell 19, looks north (heading 0) and down (horizon 1).
     bank = compile_bank([corridor_scene(24)], Task(CATEGORIES, detector=PERFECT_DETECTOR))
     pose = (19 * 8 + 0) * 2 + 1
-    search = MapTracker().init(make_knowledge())
-    squares = (search.position[None] + jnp.array([[4, 0], [40, 0]], jnp.int32)) % MAP_CELLS // 2
-    loop = AgentLoop(dataclasses.replace(ENV, task=bank.task))
-    counts = count_looks(search, jnp.asarray(bank.rows[pose]), squares, jnp.array([BOOK, CHAIR], jnp.int32), loop)
+    row = jnp.asarray(bank.rows[pose])
+
+    # Squares of a book 4 cells ahead and of a chair 40 cells ahead, out of sight.
+    state = MapTracker().init(make_knowledge())
+    object_squares = (state.position[None] + jnp.array([[4, 0], [40, 0]], jnp.int32)) % MAP_CELLS // 2
+    object_categories = jnp.array([BOOK, CHAIR], jnp.int32)
+    agent_loop = AgentLoop(dataclasses.replace(ENV, task=bank.task))
+    counts = count_looks(state, row, object_squares, object_categories, agent_loop)
     expected = np.zeros((NUM_CATEGORIES, NUM_LOOK_DISTANCES))
     expected[BOOK, 2] = 1.0
     np.testing.assert_array_equal(counts.looks, expected)
@@ -366,7 +385,7 @@ def test_looks_at_an_object_are_counted_by_distance_and_hit_where_it_is_detected
 
 
 def make_snapshot(rng):
-    """A random map with two books and a fridge that were not seen."""
+    """A random map, and two books and a fridge that are not on it."""
     shape = (MAP_SQUARES, MAP_SQUARES)
     return Snapshots(
         categories=jnp.asarray(np.where(rng.random(shape) < 0.05, 1 << CHAIR, 0).astype(np.uint32)),
@@ -387,6 +406,7 @@ def test_losses_are_negative_log_likelihoods_of_the_goals_squares():
     places_loss, layout_loss, num_goals = losses
     assert num_goals == 2  # the chair is on the map
 
+    # Minus the log of the probability on the squares of each goal, by either belief.
     squares = read_squares(jnp.zeros((MAP_CELLS, MAP_CELLS), jnp.uint32), snapshot.looks)
     squares = squares._replace(categories=snapshot.categories, floor=snapshot.floor.astype(jnp.float32) / 4)
     expected = np.zeros(2)
@@ -399,40 +419,47 @@ def test_losses_are_negative_log_likelihoods_of_the_goals_squares():
 
 
 @pytest.mark.slow
-def test_fit_finds_what_stands_near_what(monkeypatch):
-    """Books stand next to chairs: the fit makes squares near chairs likelier, for the layout and not for the places."""
-    rng = np.random.default_rng(4)
+def test_fit_learns_that_books_stand_near_chairs(monkeypatch):
+    """The fit makes squares near chairs likelier for books, by the layout and not by the places."""
     monkeypatch.setattr(belief_fit, "NUM_FIT_STEPS", 30)
     monkeypatch.setattr(belief_fit, "FIT_BATCH", 8)
+
+    # Snapshots with one chair each, and all objects on the square next to the chair.
+    rng = np.random.default_rng(4)
     snapshots = [make_snapshot(rng) for _ in range(8)]
     for index, snapshot in enumerate(snapshots):
-        chair = rng.integers(2, MAP_SQUARES - 2, 2)
+        chair_square = rng.integers(2, MAP_SQUARES - 2, 2)
         categories = np.zeros((MAP_SQUARES, MAP_SQUARES), np.uint32)
-        categories[tuple(chair)] = 1 << CHAIR
-        squares = jnp.asarray(np.repeat(chair[None] + [[0, 1]], 4, axis=0), jnp.int32)
-        snapshots[index] = snapshot._replace(categories=jnp.asarray(categories), object_squares=squares)
+        categories[tuple(chair_square)] = 1 << CHAIR
+        object_squares = jnp.asarray(np.repeat(chair_square[None] + [[0, 1]], 4, axis=0), jnp.int32)
+        snapshots[index] = snapshot._replace(categories=jnp.asarray(categories), object_squares=object_squares)
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *snapshots)
+
+    # Fit with the book as the only goal.
     agent_loop = AgentLoop(ENV, SPECS[BELIEF])
     params = init_params(SPECS[BELIEF], jax.random.key(0))
     goals = jnp.array([BOOK], jnp.int32)
-    fitted = belief_fit.fit_weights(agent_loop, params, batch, goals, jnp.ones((1, NUM_CATEGORIES)), jax.random.key(1))
-    relations = np.asarray(fitted["method"]["relations"])
+    weights = jnp.ones((1, NUM_CATEGORIES))
+    fitted_params = belief_fit.fit_weights(agent_loop, params, batch, goals, weights, jax.random.key(1))
+    relations = np.asarray(fitted_params["method"]["relations"])
     assert relations[BOOK, :, CHAIR].sum() > 1.0
     assert not relations[FRIDGE].any()  # no goal of the fit
-    np.testing.assert_array_equal(fitted["detection_rates"], params["detection_rates"])
+    np.testing.assert_array_equal(fitted_params["detection_rates"], params["detection_rates"])
 
 
-# A predictor of one's own
+# The custom predictor of the documentation
 
 
-def test_predictor_of_the_page_scores_by_its_weights():
+def test_documented_predictor_scores_by_its_weights():
     """A book is attracted by a chair with weight 1 within the smallest radius, halved from radius to radius."""
+    # Run the only code block of the page.
     page = Path(__file__).parents[2] / "docs" / "belief.md"
-    (block,) = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
-    names: dict[str, Any] = {"__name__": "page"}
-    exec(compile(block, str(page), "exec"), names)
+    (code_block,) = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
+    definitions: dict[str, Any] = {"__name__": "page"}
+    exec(compile(code_block, str(page), "exec"), definitions)
 
-    spec = PolicySpec(names["ATTRACTION"], NUM_CATEGORIES)
+    # The book is attracted by the chair in square (10, 10).
+    spec = PolicySpec(definitions["ATTRACTION"], NUM_CATEGORIES)
     params = init_params(spec, jax.random.key(0))
     assert not params["method"]["attraction"].any()
     params["method"]["attraction"] = params["method"]["attraction"].at[BOOK, CHAIR].set(1.0)
@@ -450,7 +477,7 @@ def test_predictor_of_the_page_scores_by_its_weights():
 # Refusals
 
 
-def test_a_home_larger_than_the_map_is_refused():
+def test_home_larger_than_the_map_is_refused():
     bank = compile_bank([corridor_scene(90)], Task(CATEGORIES))
     with pytest.raises(InputError, match=r"search on a map: scene drawn needs a map of 101 x 101 cells.* 96 x 96"):
         check_belief_map(Knowledge(jnp.zeros((5, 3, 3))), bank)

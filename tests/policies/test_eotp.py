@@ -1,4 +1,4 @@
-"""Attention by goal, previous action and memory, and where the layout's weights enter."""
+"""EOTP: attention by goal, previous action and memory, layout weights in the values, and the uniform ablation."""
 
 import dataclasses
 from typing import cast
@@ -53,8 +53,8 @@ def attention_shares(view, memory=MEMORY, method=EOTP):
     return np.asarray(method.attention_weights(encode(view, method=method), memory))
 
 
-def with_parts(*parts):
-    """The policy's parameters, the parts of goal, action and memory fixed."""
+def params_with_parts(*parts):
+    """The policy's parameters with fixed parts of goal, action and memory."""
     method_params = PARAMS["method"]
     kernel = jnp.zeros_like(method_params["parts"]["kernel"])
     fixed_parts = {"kernel": kernel, "bias": jnp.array(parts, jnp.float32)}
@@ -130,37 +130,39 @@ CHANGED_QUERIES = {
 
 @pytest.mark.parametrize(("part_index", "query_name"), list(enumerate(CHANGED_QUERIES)))
 def test_each_query_changes_attention_only_by_its_part(part_index, query_name):
-    """By each alone where its part is 4, and not where it is 0."""
+    """A query whose part is 4 changes the attention without the other two, and one whose part is 0 does not."""
     goal, memory = CHANGED_QUERIES[query_name]
     only_part = np.zeros(3)
     only_part[part_index] = 4.0
     other_parts = 4.0 - only_part
 
-    def shares_before_and_after(parts):
-        """The attention for the fridge, and with the changed query; the goal's flag in the rows stays."""
-        method = bind_attention(with_parts(*parts))
+    def compute_shares(parts):
+        """Attention for the fridge before and after the query changes; the goal's flag in the rows stays."""
+        method = bind_attention(params_with_parts(*parts))
         entries = encode(make_view(BOOK, CHAIR, FRIDGE), method=method)
         changed_entries = entries._replace(goal=encode(make_view(goal=goal), method=method).goal)
         shares = np.asarray(method.attention_weights(entries, MEMORY))
         changed_shares = np.asarray(method.attention_weights(changed_entries, memory))
         return shares, changed_shares
 
-    shares, changed_shares = shares_before_and_after(only_part)
+    shares, changed_shares = compute_shares(only_part)
     assert np.abs(shares - changed_shares).max() > 0.02
-    np.testing.assert_array_equal(*shares_before_and_after(other_parts))
+    np.testing.assert_array_equal(*compute_shares(other_parts))
+
+    # Without any part the attention is uniform.
     uniform_shares = np.full((2, NUM_CATEGORIES), 1 / NUM_CATEGORIES)
-    np.testing.assert_allclose(shares_before_and_after(np.zeros(3)), uniform_shares, rtol=1e-6)
+    np.testing.assert_allclose(compute_shares(np.zeros(3)), uniform_shares, rtol=1e-6)
 
 
 def test_parts_are_computed_from_the_memory():
-    np.testing.assert_array_equal(bind_attention(with_parts(1, 2, 0)).parts(MEMORY.hidden), [1, 2, 0])
+    np.testing.assert_array_equal(bind_attention(params_with_parts(1, 2, 0)).parts(MEMORY.hidden), [1, 2, 0])
     assert np.abs(EOTP.parts(MEMORY.hidden) - EOTP.parts(START_MEMORY.hidden)).max() > 0.1
 
 
-def test_first_attention_of_an_episode_uses_the_goal_alone():
+def test_first_attention_of_an_episode_uses_only_the_goal():
     view = make_view(BOOK, CHAIR, FRIDGE)
     goal_part, _, _ = EOTP.parts(START_MEMORY.hidden)
-    goal_only = bind_attention(with_parts(goal_part, 0, 0))
+    goal_only = bind_attention(params_with_parts(goal_part, 0, 0))
     shares = attention_shares(view, START_MEMORY)
     np.testing.assert_allclose(shares, attention_shares(view, START_MEMORY, goal_only), rtol=1e-5)
 
@@ -178,7 +180,7 @@ def test_fresh_attention_depends_on_the_goal_from_the_start():
 # Lengths and layout weights
 
 
-def test_attention_depends_on_directions_of_embeddings_alone():
+def test_attention_depends_only_on_the_directions_of_embeddings():
     """Embeddings three times as long get the same attention and have values three times as large."""
     maps = PARAMS["method"]["maps"]
     long_maps = maps | {"inner": jax.tree.map(lambda leaf: 3 * leaf, maps["inner"])}
@@ -219,7 +221,7 @@ def test_category_of_weight_zero_has_the_same_experience_detected_or_not():
     np.testing.assert_array_equal(book_experience(make_view(BOOK, CHAIR)), book_experience(make_view(CHAIR)))
 
 
-# The ablation
+# The uniform ablation
 
 UNIFORM_SPEC = dataclasses.replace(SPEC, method=find_method("jaxnav.policies.methods.eotp:UNIFORM"))
 UNIFORM = bind_attention(spec=UNIFORM_SPEC)
@@ -238,7 +240,7 @@ def test_uniform_attention_ignores_every_query(detected, goal, memory):
     np.testing.assert_allclose(attention_shares(view, memory, UNIFORM), is_attended / is_attended.sum(), rtol=1e-6)
 
 
-def test_uniform_attention_differs_from_eotp_by_attention_alone():
+def test_uniform_attention_differs_from_eotp_only_by_attention():
     assert type(UNIFORM) is UniformAttention is UNIFORM_SPEC.method.experience
     assert jax.tree.structure(init_params(UNIFORM_SPEC, jax.random.key(0))) == jax.tree.structure(PARAMS)
     # A single category gets all attention.

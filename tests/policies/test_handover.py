@@ -1,4 +1,4 @@
-"""Two policies of which one acts: a hand-over leaves the layout-blind one, as if it had acted all along."""
+"""Handover: a removal of experience leaves the fallback policy, bit-identical to one that acted from the start."""
 
 import dataclasses
 
@@ -24,117 +24,138 @@ from jaxnav.runs.policies import Policies
 
 ENV, PARAMS = tiny.world()
 KNOWLEDGE = Knowledge(0.05 * tiny.knowledge().layout)
-ANONYMOUS = dataclasses.replace(tiny.SPEC, method=find_method("anonymous"), method_sizes=())
-PAIR = AgentLoop(ENV, tiny.SPEC, tiny.ESTIMATOR, fallback_spec=ANONYMOUS)
-ALONE = AgentLoop(ENV, ANONYMOUS)
-AGENT, WITHOUT = tiny.random_params(6), tiny.random_params(9, ANONYMOUS)
-BOTH = {"agent": AGENT, "without": WITHOUT}
-EPISODES, KEY = draw_episodes(tiny.BANK, 24, seed=1), jax.random.key(3)
-
-
-def make_cells(row, **changes):
-    """The cell of a row, with something changed."""
-    cells = inference_grid([row], ("layout",), 1)
-    return cells.replace(**{name: jnp.full_like(getattr(cells, name), value) for name, value in changes.items()})
-
-
-def play(acting, weights, *cells):
-    """How the episodes of each cell go, all compiled as one program."""
-    grid = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *cells)
-    stacked = jax.tree.map(lambda leaf: leaf[None], weights)
-    outcome = Evaluator(acting)(grid, stacked, [(EPISODES, PARAMS)], KNOWLEDGE, KEY)
-    return [tiny.leaves_at(outcome, index) for index in range(len(cells))]
-
-
-def alike(one, other):
-    """Check that episodes went alike, whatever was removed in them."""
-    chex.assert_trees_all_equal(one._replace(mean_weight=0), other._replace(mean_weight=0))
-
+ANONYMOUS_SPEC = dataclasses.replace(tiny.SPEC, method=find_method("anonymous"), method_sizes=())
+#: Agents with experience, layout-blind agents, and pairs of an agent with experience and a layout-blind fallback.
+EXPERIENCED_LOOP = AgentLoop(ENV, tiny.SPEC, tiny.ESTIMATOR)
+BLIND_LOOP = AgentLoop(ENV, ANONYMOUS_SPEC)
+PAIR_LOOP = AgentLoop(ENV, tiny.SPEC, tiny.ESTIMATOR, fallback_spec=ANONYMOUS_SPEC)
+EXPERIENCED_PARAMS = tiny.random_params(6)
+BLIND_PARAMS = tiny.random_params(9, ANONYMOUS_SPEC)
+PAIR_PARAMS = {"agent": EXPERIENCED_PARAMS, "without": BLIND_PARAMS}
+EPISODES = draw_episodes(tiny.BANK, 24, seed=1)
+KEY = jax.random.key(3)
+BATCH_SIZE = 8
 
 LAYOUT_ROW = table_row("layout", None, None, "argmax")
 
 
-@pytest.fixture(scope="module")
-def layout_blind():
-    """Episodes of the layout-blind policy, which wears the name of the one arm that is there."""
-    return play(ALONE, WITHOUT, make_cells(LAYOUT_ROW))[0]
+def make_grid_cell(row, **changes):
+    """Grid with the single cell of a table row, some of its fields set to other values."""
+    grid = inference_grid([row], ("layout",), 1)
+    changed_fields = {}
+    for name, value in changes.items():
+        changed_fields[name] = jnp.full_like(getattr(grid, name), value)
+    return grid.replace(**changed_fields)
+
+
+def run_episodes(agent_loop, params, *grid_cells):
+    """Outcomes of the episodes of each grid cell, all compiled as one program."""
+    grid = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *grid_cells)
+    stacked_params = jax.tree.map(lambda leaf: leaf[None], params)
+    outcomes = Evaluator(agent_loop)(grid, stacked_params, [(EPISODES, PARAMS)], KNOWLEDGE, KEY)
+    return [tiny.leaves_at(outcomes, index) for index in range(len(grid_cells))]
+
+
+def assert_equal_episodes(outcome, expected):
+    """Check that episodes are bit-identical, whatever was removed in them."""
+    chex.assert_trees_all_equal(outcome._replace(mean_weight=0), expected._replace(mean_weight=0))
+
+
+# A layout-blind fallback
 
 
 @pytest.fixture(scope="module")
-def handed_over():
-    """Episodes of the pair: never handed over, under TDE, handed over at the first step, and two steps later."""
-    switch = table_row("stde", 0.5, "switch", "argmax")
-    given = {"gap_source": GapSource.GIVEN, "given_gap": 1.0, "gap_end": 2**30}
-    cells = {
-        "never": make_cells(LAYOUT_ROW),
-        "TDE": make_cells(table_row("tde", None, None, "argmax")),
-        "at once": make_cells(switch, gap_begin=0, **given),
-        "later": make_cells(switch, gap_begin=2, **given),
+def blind_outcome():
+    """Episodes of the layout-blind policy; its row has the name of the only arm in the grid."""
+    (outcome,) = run_episodes(BLIND_LOOP, BLIND_PARAMS, make_grid_cell(LAYOUT_ROW))
+    return outcome
+
+
+@pytest.fixture(scope="module")
+def pair_outcomes():
+    """Episodes of the pair: no handover, TDE, handover at the first step, and handover two steps later."""
+    tde_row = table_row("tde", None, None, "argmax")
+    switch_row = table_row("stde", 0.5, "switch", "argmax")
+    full_gap = {"gap_source": GapSource.GIVEN, "given_gap": 1.0, "gap_end": 2**30}
+    grid_cells = {
+        "no handover": make_grid_cell(LAYOUT_ROW),
+        "TDE": make_grid_cell(tde_row),
+        "first step": make_grid_cell(switch_row, gap_begin=0, **full_gap),
+        "third step": make_grid_cell(switch_row, gap_begin=2, **full_gap),
     }
-    return dict(zip(cells, play(PAIR, BOTH, *cells.values()), strict=True))
+    outcomes = run_episodes(PAIR_LOOP, PAIR_PARAMS, *grid_cells.values())
+    return dict(zip(grid_cells, outcomes, strict=True))
 
 
 @pytest.mark.slow
-def test_what_removal_leaves_is_the_layout_blind_policy_to_the_bit():
-    decider = PAIR.bind_decider(BOTH)
-    batch = jnp.arange(8)
-    agent = PAIR.start(KEY, len(batch), decider.initial_memory(batch.shape), KNOWLEDGE, PARAMS)
+def test_removal_leaves_the_layout_blind_policy_bit_for_bit():
+    # Factual and counterfactual decision of the pair at the start of episodes.
+    decider = PAIR_LOOP.bind_decider(PAIR_PARAMS)
+    batch_shape = (BATCH_SIZE,)
+    agent = PAIR_LOOP.start(KEY, BATCH_SIZE, decider.initial_memory(batch_shape), KNOWLEDGE, PARAMS)
     memory = agent.memory
     assert memory is not None
-    view = PAIR.policy_inputs(agent, KNOWLEDGE, PARAMS)
-    pathways = decider.pathways(view, memory)
+    inputs = PAIR_LOOP.policy_inputs(agent, KNOWLEDGE, PARAMS)
+    pathways = decider.pathways(inputs, memory)
     factual = decider.decide(pathways, memory)
-    removed = decider.decide(do(pathways, scene=0.0, goal=0.0), memory)
-    own, other = PAIR.bind(AGENT), ALONE.bind(WITHOUT)
-    knowing = own.decide(own.pathways(view), own.initial_memory(batch.shape))
-    unknowing = other.decide(
-        other.pathways(view._replace(layout_weights=jnp.ones_like(view.layout_weights), reading=None)),
-        other.initial_memory(batch.shape),
+    counterfactual = decider.decide(do(pathways, scene=0.0, goal=0.0), memory)
+
+    # Decisions of the two policies on their own; the layout-blind one knows no layout and has no tracker.
+    experienced_policy = PAIR_LOOP.bind(EXPERIENCED_PARAMS)
+    experienced = experienced_policy.decide(
+        experienced_policy.pathways(inputs), experienced_policy.initial_memory(batch_shape)
     )
-    chex.assert_trees_all_equal(factual.logits - removed.logits, round_to_grid(unknowing.logits))
-    chex.assert_trees_all_equal(factual.logits, round_to_grid(knowing.logits))
-    chex.assert_trees_all_equal(factual.hidden, jnp.concatenate([knowing.hidden, unknowing.hidden], axis=-1))
-    assert np.abs(knowing.logits - unknowing.logits).max() > 0.1
+    blind_policy = BLIND_LOOP.bind(BLIND_PARAMS)
+    blind_inputs = inputs._replace(layout_weights=jnp.ones_like(inputs.layout_weights), reading=None)
+    blind = blind_policy.decide(blind_policy.pathways(blind_inputs), blind_policy.initial_memory(batch_shape))
+
+    # The pair decides like its policy with experience, and eq. 1 leaves the layout-blind policy.
+    chex.assert_trees_all_equal(factual.logits - counterfactual.logits, round_to_grid(blind.logits))
+    chex.assert_trees_all_equal(factual.logits, round_to_grid(experienced.logits))
+    chex.assert_trees_all_equal(factual.hidden, jnp.concatenate([experienced.hidden, blind.hidden], axis=-1))
+    assert np.abs(experienced.logits - blind.logits).max() > 0.1
 
 
 @pytest.mark.slow
-def test_without_removal_the_policy_with_experience_acts(handed_over):
-    (alone,) = play(AgentLoop(ENV, tiny.SPEC, tiny.ESTIMATOR), AGENT, make_cells(LAYOUT_ROW))
-    alike(handed_over["never"], alone)
+def test_without_removal_the_policy_with_experience_acts(pair_outcomes):
+    (experienced_outcome,) = run_episodes(EXPERIENCED_LOOP, EXPERIENCED_PARAMS, make_grid_cell(LAYOUT_ROW))
+    assert_equal_episodes(pair_outcomes["no handover"], experienced_outcome)
 
 
 @pytest.mark.slow
-def test_under_tde_the_layout_blind_policy_acts(handed_over, layout_blind):
-    alike(handed_over["TDE"], layout_blind)
+def test_under_tde_the_layout_blind_policy_acts(pair_outcomes, blind_outcome):
+    assert_equal_episodes(pair_outcomes["TDE"], blind_outcome)
 
 
 @pytest.mark.slow
-def test_handed_over_at_the_first_step_it_is_the_same(handed_over, layout_blind):
-    at_once, later = handed_over["at once"], handed_over["later"]
-    alike(at_once, layout_blind)
-    # Two steps later it is neither of the two, but begins as the one with experience.
-    assert (np.asarray(later.length) != np.asarray(at_once.length)).any()
-    assert (np.asarray(later.mean_weight) > 0).any()
-    assert (np.asarray(later.mean_weight) < 1).all()
+def test_handover_at_the_first_step_gives_episodes_of_the_layout_blind_policy(pair_outcomes, blind_outcome):
+    first_step = pair_outcomes["first step"]
+    third_step = pair_outcomes["third step"]
+    assert_equal_episodes(first_step, blind_outcome)
+
+    # Two steps later the pair acts like neither policy, but begins like the policy with experience.
+    assert (np.asarray(third_step.length) != np.asarray(first_step.length)).any()
+    assert (np.asarray(third_step.mean_weight) > 0).any()
+    assert (np.asarray(third_step.mean_weight) < 1).all()
 
 
-# The same network without experience
+# The same network without experience as the fallback
 
 
-DROPPING = dataclasses.replace(tiny.SPEC, experience_dropout=True)
-OWN_PAIR = AgentLoop(ENV, DROPPING, tiny.ESTIMATOR, use_own_fallback=True)
+DROPOUT_SPEC = dataclasses.replace(tiny.SPEC, experience_dropout=True)
+OWN_FALLBACK_LOOP = AgentLoop(ENV, DROPOUT_SPEC, tiny.ESTIMATOR, use_own_fallback=True)
 
 
-def follow_alone(policy, inputs_by_step, actions, use_experience):
+def replay_logits(policy, inputs_by_step, actions, use_experience):
     """Logits of each step of a policy that has experience in all steps or in none."""
     batch_size = len(actions[0])
     memory = policy.initial_memory((batch_size,))._replace(use_experience=jnp.full(batch_size, use_experience))
-    logits = []
+    logits_by_step = []
     for inputs, action in zip(inputs_by_step, actions, strict=True):
         decision = policy.decide(policy.pathways(inputs, memory), memory)
-        logits.append(decision.logits)
+        logits_by_step.append(decision.logits)
         memory = decision.next_state(action)
-    return logits
+    return logits_by_step
 
 
 @pytest.mark.slow
@@ -142,107 +163,129 @@ def follow_alone(policy, inputs_by_step, actions, use_experience):
     "method_name",
     [
         "org",
-        *(pytest.param(f"support.methods:{name}", marks=pytest.mark.exhaustive) for name in ("ATTENTIVE", "ADAPTIVE")),
+        pytest.param("support.methods:ATTENTIVE", marks=pytest.mark.exhaustive),
+        pytest.param("support.methods:ADAPTIVE", marks=pytest.mark.exhaustive),
     ],
 )
-def test_reference_removal_leaves_the_network_without_experience_to_the_bit(method_name):
+def test_reference_removal_leaves_the_network_without_experience_bit_for_bit(method_name):
     """At s = 1, at every step of an episode: eq. 1 leaves a0, whose memory has never held experience."""
-    spec = dataclasses.replace(DROPPING, method=find_method(method_name), method_sizes=())
-    loop = dataclasses.replace(OWN_PAIR, spec=spec)
+    spec = dataclasses.replace(DROPOUT_SPEC, method=find_method(method_name), method_sizes=())
+    agent_loop = dataclasses.replace(OWN_FALLBACK_LOOP, spec=spec)
     params = tiny.random_params(6, spec)
-    decider = loop.bind_decider(params)
-    agent = loop.start(KEY, 8, decider.initial_memory((8,)), KNOWLEDGE, PARAMS)
-    inputs_by_step, actions, factual_by_step, removed_by_step = [], [], [], []
+    decider = agent_loop.bind_decider(params)
+    agent = agent_loop.start(KEY, BATCH_SIZE, decider.initial_memory((BATCH_SIZE,)), KNOWLEDGE, PARAMS)
+
+    # Follow the episodes for four steps with and without removal.
+    inputs_by_step = []
+    actions = []
+    factual_by_step = []
+    removed_by_step = []
     for step in range(4):
         memory = agent.memory
         assert memory is not None
-        inputs = loop.policy_inputs(agent, KNOWLEDGE, PARAMS)
+        inputs = agent_loop.policy_inputs(agent, KNOWLEDGE, PARAMS)
         pathways = decider.pathways(inputs, memory)
         decision = decider.decide(pathways, memory)
         counterfactual = decider.decide(do(pathways, scene=0.0, goal=0.0), memory.counterfactual_state())
         inputs_by_step.append(inputs)
         factual_by_step.append(decision.logits)
         removed_by_step.append(tde(decision.logits, counterfactual.logits))
-        # Moves and turns alone, so that no episode ends.
-        action = (jnp.arange(8) + step) % 3
-        actions.append(action)
-        agent, _ = loop.step(agent, action, KNOWLEDGE, PARAMS, policy=decider, decision=decision)
 
-    policy = loop.bind(params)
-    chex.assert_trees_all_equal(
-        removed_by_step, [round_to_grid(logits) for logits in follow_alone(policy, inputs_by_step, actions, 0.0)]
-    )
-    chex.assert_trees_all_equal(
-        factual_by_step, [round_to_grid(logits) for logits in follow_alone(policy, inputs_by_step, actions, 1.0)]
-    )
+        # Moves and turns alone, so that no episode ends.
+        action = (jnp.arange(BATCH_SIZE) + step) % 3
+        actions.append(action)
+        agent, _ = agent_loop.step(agent, action, KNOWLEDGE, PARAMS, policy=decider, decision=decision)
+
+    # Replay the same inputs and actions by the plain network.
+    policy = agent_loop.bind(params)
+    logits_without_experience = replay_logits(policy, inputs_by_step, actions, 0.0)
+    logits_with_experience = replay_logits(policy, inputs_by_step, actions, 1.0)
+    chex.assert_trees_all_equal(removed_by_step, [round_to_grid(logits) for logits in logits_without_experience])
+    chex.assert_trees_all_equal(factual_by_step, [round_to_grid(logits) for logits in logits_with_experience])
     assert np.abs(removed_by_step[-1] - factual_by_step[-1]).max() > 0.05
 
 
 @pytest.mark.slow
 def test_half_of_the_reference_removal_lies_midway():
-    """The form `paper` is a - s (a - a0): at s = 1/2 the mean of both logits."""
-    decider = OWN_PAIR.bind_decider(AGENT)
-    agent = OWN_PAIR.start(KEY, 8, decider.initial_memory((8,)), KNOWLEDGE, PARAMS)
+    """The form `paper` is a - s (a - a0): at s = 1/2 the mean of the logits a and a0."""
+    decider = OWN_FALLBACK_LOOP.bind_decider(EXPERIENCED_PARAMS)
+    agent = OWN_FALLBACK_LOOP.start(KEY, BATCH_SIZE, decider.initial_memory((BATCH_SIZE,)), KNOWLEDGE, PARAMS)
     memory = agent.memory
     assert memory is not None
-    pathways = decider.pathways(OWN_PAIR.policy_inputs(agent, KNOWLEDGE, PARAMS), memory)
-    factual = decider.decide(pathways, memory).logits
-    removed = decider.decide(do(pathways, scene=0.0, goal=0.0), memory).logits
-    without_experience = tde(factual, removed)
-    result = stde(factual, removed, jnp.full(8, 0.5), 0.0, "paper")
-    np.testing.assert_allclose(result, (factual + without_experience) / 2, atol=1e-6)
+    pathways = decider.pathways(OWN_FALLBACK_LOOP.policy_inputs(agent, KNOWLEDGE, PARAMS), memory)
+    factual_logits = decider.decide(pathways, memory).logits
+    counterfactual_logits = decider.decide(do(pathways, scene=0.0, goal=0.0), memory).logits
+    logits_without_experience = tde(factual_logits, counterfactual_logits)
+    half_removed = stde(factual_logits, counterfactual_logits, jnp.full(BATCH_SIZE, 0.5), 0.0, "paper")
+    np.testing.assert_allclose(half_removed, (factual_logits + logits_without_experience) / 2, atol=1e-6)
 
 
 @pytest.mark.exhaustive
-def test_under_cde_episodes_are_those_of_the_network_without_experience():
+def test_episodes_under_cde_equal_those_of_the_network_without_experience():
     """Whole episodes: a policy whose experience columns are zero takes the same actions."""
-    kernel = AGENT["fuse"]["kernel"]
-    policy = AgentLoop(ENV, DROPPING).bind(AGENT)
+    # Zero the rows of the kernel that read the experience, which follows the first two pathways.
+    kernel = EXPERIENCED_PARAMS["fuse"]["kernel"]
+    policy = AgentLoop(ENV, DROPOUT_SPEC).bind(EXPERIENCED_PARAMS)
     first_row = sum(policy.widths[:2])
-    mute_kernel = kernel.at[first_row : first_row + policy.widths[2]].set(0.0)
-    mute = AGENT | {"fuse": AGENT["fuse"] | {"kernel": mute_kernel}}
+    muted_kernel = kernel.at[first_row : first_row + policy.widths[2]].set(0.0)
+    muted_params = EXPERIENCED_PARAMS | {"fuse": EXPERIENCED_PARAMS["fuse"] | {"kernel": muted_kernel}}
+
+    # Compare whole episodes.
     cde_row = table_row("cde", None, None, "argmax")
-    removed, plain = play(OWN_PAIR, AGENT, make_cells(cde_row), make_cells(LAYOUT_ROW))
-    (muted,) = play(AgentLoop(ENV, DROPPING, tiny.ESTIMATOR), mute, make_cells(LAYOUT_ROW))
-    alike(removed, muted)
+    cde_outcome, factual_outcome = run_episodes(
+        OWN_FALLBACK_LOOP, EXPERIENCED_PARAMS, make_grid_cell(cde_row), make_grid_cell(LAYOUT_ROW)
+    )
+    dropout_loop = AgentLoop(ENV, DROPOUT_SPEC, tiny.ESTIMATOR)
+    (muted_outcome,) = run_episodes(dropout_loop, muted_params, make_grid_cell(LAYOUT_ROW))
+    assert_equal_episodes(cde_outcome, muted_outcome)
+
     # Negative control: with experience the episodes differ.
-    assert (np.asarray(plain.length) != np.asarray(removed.length)).any()
+    assert (np.asarray(factual_outcome.length) != np.asarray(cde_outcome.length)).any()
 
 
 def test_own_fallback_replaces_the_counterfactual_memory():
-    loop = dataclasses.replace(OWN_PAIR, spec=dataclasses.replace(DROPPING, counterfactual_memory="own"))
-    memory = loop.bind_decider(AGENT).initial_memory((2,))
+    spec = dataclasses.replace(DROPOUT_SPEC, counterfactual_memory="own")
+    agent_loop = dataclasses.replace(OWN_FALLBACK_LOOP, spec=spec)
+    memory = agent_loop.bind_decider(EXPERIENCED_PARAMS).initial_memory((2,))
     assert memory.counterfactual_hidden is None
     assert memory.hidden.shape == (2, 2 * tiny.SIZES.hidden)
 
 
-def test_policies_that_always_had_experience_have_no_own_fallback():
-    with pytest.raises(InputError, match=r"cde: these policies had experience in every .* --ppo.experience below 1"):
-        policies(tiny.SPEC, AGENT).with_own_fallback()
-    for spec in (DROPPING, tiny.STREAMS):
-        assert policies(spec, AGENT).with_own_fallback().use_own_fallback
+# Policies of runs
 
 
-def test_own_counterfactual_memory_needs_one_from_training():
-    own = dataclasses.replace(tiny.SPEC, counterfactual_memory="own")
-    with pytest.raises(InputError, match=r"--counterfactual-memory own: .* trained without a memory of its own; train"):
-        policies(tiny.SPEC, AGENT).with_counterfactual_memory("own")
-    assert policies(own, AGENT).with_counterfactual_memory("own").spec == own
-    assert policies(own, AGENT).with_counterfactual_memory("factual").spec == tiny.SPEC
-    assert policies(own, AGENT).with_counterfactual_memory(None).spec == own
-
-
-def policies(spec, params):
+def make_policies(spec, params):
     knowledge = Knowledge(KNOWLEDGE.layout)
     return Policies(params, ("layout",), knowledge, knowledge.layout, spec, None, 0, tiny.BANK.task)
 
 
-def test_parameters_stand_side_by_side():
-    one, other = (jax.tree.map(lambda leaf: leaf[None], tree) for tree in (AGENT, WITHOUT))
-    pair = policies(tiny.SPEC, one).with_handover_to(policies(ANONYMOUS, other))
-    assert pair.fallback_spec == ANONYMOUS
+def test_policies_that_always_had_experience_have_no_own_fallback():
+    with pytest.raises(InputError, match=r"cde: these policies had experience in every .* --ppo.experience below 1"):
+        make_policies(tiny.SPEC, EXPERIENCED_PARAMS).with_own_fallback()
+    for spec in (DROPOUT_SPEC, tiny.STREAMS):
+        assert make_policies(spec, EXPERIENCED_PARAMS).with_own_fallback().use_own_fallback
+
+
+def test_own_counterfactual_memory_needs_one_from_training():
+    with pytest.raises(InputError, match=r"--counterfactual-memory own: .* trained without a memory of its own; train"):
+        make_policies(tiny.SPEC, EXPERIENCED_PARAMS).with_counterfactual_memory("own")
+
+    # Policies with a memory from training can use either memory.
+    own_memory_spec = dataclasses.replace(tiny.SPEC, counterfactual_memory="own")
+    policies = make_policies(own_memory_spec, EXPERIENCED_PARAMS)
+    assert policies.with_counterfactual_memory("own").spec == own_memory_spec
+    assert policies.with_counterfactual_memory("factual").spec == tiny.SPEC
+    assert policies.with_counterfactual_memory(None).spec == own_memory_spec
+
+
+def test_handover_joins_the_parameters_of_the_two_policies():
+    experienced_params = jax.tree.map(lambda leaf: leaf[None], EXPERIENCED_PARAMS)
+    blind_params = jax.tree.map(lambda leaf: leaf[None], BLIND_PARAMS)
+    blind_policies = make_policies(ANONYMOUS_SPEC, blind_params)
+    pair = make_policies(tiny.SPEC, experienced_params).with_handover_to(blind_policies)
+    assert pair.fallback_spec == ANONYMOUS_SPEC
     assert pair.num_seeds == 1
-    chex.assert_trees_all_equal(pair.params, {"agent": one, "without": other})
+    chex.assert_trees_all_equal(pair.params, {"agent": experienced_params, "without": blind_params})
 
 
 @pytest.mark.parametrize(
@@ -256,15 +299,17 @@ def test_parameters_stand_side_by_side():
         ({"spatial_memory": None}, "the runs have different spatial memories; train both"),
     ],
 )
-def test_what_cannot_be_handed_over_to_is_refused(changes, remedy):
-    own = dataclasses.replace(tiny.SPEC, spatial_memory=SpatialMemory(8))
-    other = dataclasses.replace(ANONYMOUS, **{"spatial_memory": own.spatial_memory} | changes)
+def test_handover_to_unsuitable_policies_is_refused(changes, remedy):
+    memory = SpatialMemory(8)
+    spec = dataclasses.replace(tiny.SPEC, spatial_memory=memory)
+    fallback_spec = dataclasses.replace(ANONYMOUS_SPEC, **{"spatial_memory": memory} | changes)
     with pytest.raises(InputError, match=remedy):
-        policies(own, AGENT).with_handover_to(policies(other, WITHOUT))
+        make_policies(spec, EXPERIENCED_PARAMS).with_handover_to(make_policies(fallback_spec, BLIND_PARAMS))
 
 
-def test_a_hand_over_needs_equally_many_policies():
-    one = jax.tree.map(lambda leaf: leaf[None], AGENT)
-    two = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), WITHOUT)
+def test_handover_needs_equally_many_policies():
+    single_params = jax.tree.map(lambda leaf: leaf[None], EXPERIENCED_PARAMS)
+    double_params = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), BLIND_PARAMS)
+    blind_policies = make_policies(ANONYMOUS_SPEC, double_params)
     with pytest.raises(InputError, match="1 policies cannot hand over to 2; train both runs with equal arms and seeds"):
-        policies(tiny.SPEC, one).with_handover_to(policies(ANONYMOUS, two))
+        make_policies(tiny.SPEC, single_params).with_handover_to(blind_policies)

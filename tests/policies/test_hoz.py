@@ -1,4 +1,4 @@
-"""Zones of scenes whose graph can be written down, and what HOZ makes of them."""
+"""HOZ: room type, zones and nodes of the tracker in corridors with a known graph, and the network's experience."""
 
 import dataclasses
 import functools
@@ -40,160 +40,211 @@ from jaxnav.policies.pathways import NO_ACTION
 from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import MOVE_AHEAD, ROTATE_RIGHT
 
-# What an episode remembers
+# The tracker
 
 
-TRACKER = ZoneTracker(node_rate=0.25)
-update = jax.jit(TRACKER.update)
-read_of = jax.jit(TRACKER.read)
+NODE_RATE = 0.25
+TRACKER = ZoneTracker(node_rate=NODE_RATE)
+update_state = jax.jit(TRACKER.update)
+read_state = jax.jit(TRACKER.read)
 
 
-def knowledge_of(*banks_of, zones=3):
-    return Knowledge(jnp.zeros(0), jax.tree.map(jnp.asarray, learned(*banks_of, zones=zones)))
+def make_knowledge(zones):
+    return Knowledge(jnp.zeros(0), jax.tree.map(jnp.asarray, zones))
 
 
-def see(note, knowledge, cell, heading=EAST):
+def look(state, knowledge, row, heading=EAST):
+    """Update the state by the view of a row, without an action."""
+    percept = Percept(
+        jnp.asarray(row), jnp.int32(heading), jnp.int32(NO_ACTION), jnp.bool_(False), jnp.int32(0), jnp.int32(0)
+    )
+    return update_state(state, knowledge, percept)
+
+
+def look_from_cell(state, knowledge, cell, heading=EAST):
     """Look from a cell of the corridor of book, chair and fridge."""
-    row = jnp.asarray(PATH.rows[cell * PER_CELL + 2 * heading])
-    nothing = jnp.int32(NO_ACTION), jnp.bool_(False), jnp.int32(0), jnp.int32(0)
-    return update(note, knowledge, Percept(row, jnp.int32(heading), *nothing))
+    return look(state, knowledge, PATH.rows[cell * PER_CELL + 2 * heading], heading)
 
 
-def test_the_zone_follows_a_walk_and_the_next_zone_leads_to_the_goal():
+def test_zone_follows_the_walk_and_next_zone_leads_to_the_goal():
     """East along the corridor, a turn, and back: B B B C C C F F F F F C."""
-    knowledge = knowledge_of(*KITCHENS)
     zones = learned(*KITCHENS)
-    name = {holding(zones, category): category for category in range(K)}
-    successor, pose, note = PATH.successor, 2 * EAST, TRACKER.init(knowledge)
-    walk = [MOVE_AHEAD] * 8 + [ROTATE_RIGHT] * 4 + [MOVE_AHEAD] * 3
-    trace, ahead = [], []
-    for action in [None, *walk]:
-        pose = pose if action is None else int(successor[pose, action])
-        note = see(note, knowledge, pose // PER_CELL, pose // 2 % 8)
-        trace.append(name[int(note.zone)])
-        # The zone on the way to the fridge is told by what is seen in it: its node mixed with those beside it.
-        reading = read_of(note, knowledge, FRIDGE)
-        ahead.append(reading.zone_rows)
-    assert trace == [BOOK] * 3 + [CHAIR] * 3 + [FRIDGE] * 3 + [FRIDGE] * 4 + [FRIDGE] * 2 + [CHAIR]
-    mixing, nodes = zones["mixing"][KITCHEN], np.eye(3)[[name[zone] for zone in range(3)]]
-    book, chair, fridge = (holding(zones, category) for category in range(K))
-    for cell, place in ((0, (book, chair, fridge)), (4, (chair, fridge, fridge)), (8, (fridge, fridge, fridge))):
-        np.testing.assert_allclose(ahead[cell], (mixing @ nodes)[list(place)], atol=1e-6)
+    knowledge = make_knowledge(zones)
+    zone_by_category = [holding(zones, category) for category in range(K)]
+    category_by_zone = {zone: category for category, zone in enumerate(zone_by_category)}
+
+    # Poses of the walk, which begins in the first cell.
+    pose = 2 * EAST
+    poses = [pose]
+    for action in [MOVE_AHEAD] * 8 + [ROTATE_RIGHT] * 4 + [MOVE_AHEAD] * 3:
+        pose = int(PATH.successor[pose, action])
+        poses.append(pose)
+
+    # Follow the walk on the way to the fridge.
+    state = TRACKER.init(knowledge)
+    walk_categories = []
+    zone_rows = []
+    for pose in poses:
+        state = look_from_cell(state, knowledge, pose // PER_CELL, pose // 2 % 8)
+        walk_categories.append(category_by_zone[int(state.zone)])
+        zone_rows.append(read_state(state, knowledge, FRIDGE).zone_rows)
+    assert walk_categories == [BOOK] * 3 + [CHAIR] * 3 + [FRIDGE] * 3 + [FRIDGE] * 4 + [FRIDGE] * 2 + [CHAIR]
+
+    # The current, the next and the goal's zone are described by their nodes, mixed with the adjoining nodes. The node
+    # of a zone is the one-hot vector of its category.
+    nodes = np.eye(3)[[category_by_zone[zone] for zone in range(3)]]
+    mixed_nodes = zones["mixing"][KITCHEN] @ nodes
+    book_zone, chair_zone, fridge_zone = zone_by_category
+    for cell, expected_zones in (
+        (0, [book_zone, chair_zone, fridge_zone]),
+        (4, [chair_zone, fridge_zone, fridge_zone]),
+        (8, [fridge_zone, fridge_zone, fridge_zone]),
+    ):
+        np.testing.assert_allclose(zone_rows[cell], mixed_nodes[expected_zones], atol=1e-6)
 
 
 def test_zones_without_poses_are_never_entered():
     zones = learned(*KITCHENS, zones=5)  # three different views
-    held = zones["nodes"][KITCHEN].max(axis=-1) >= 0
-    assert held.sum() == 3
-    assert (zones["nodes"][KITCHEN][~held] == -1).all()
+    has_poses = zones["nodes"][KITCHEN].max(axis=-1) >= 0
+    assert has_poses.sum() == 3
+    assert (zones["nodes"][KITCHEN][~has_poses] == -1).all()
     assert (zones["nodes"][BEDROOM] == -1).all()
     assert indirect_share(zones, zones["next_zone"]) == 2 / 6
     assert all(np.isfinite(zones[name]).all() for name in ("nodes", "mixing", "detected"))
-    knowledge = Knowledge(jnp.zeros(0), jax.tree.map(jnp.asarray, zones))
-    note = ZoneTracker().init(knowledge)
+
+    # Walk through the corridor.
+    knowledge = make_knowledge(zones)
+    state = ZoneTracker().init(knowledge)
     for cell in range(9):
-        note = see(note, knowledge, cell)
-        assert held[note.zone]
-        assert (read_of(note, knowledge, BOOK).zone_rows >= 0).all()
+        state = look_from_cell(state, knowledge, cell)
+        assert has_poses[state.zone]
+        assert (read_state(state, knowledge, BOOK).zone_rows >= 0).all()
 
 
-def test_a_view_pulls_the_node_of_its_zone_alone():
-    knowledge = knowledge_of(*KITCHENS)
-    book = holding(learned(*KITCHENS), BOOK)
-    both = np.array(PATH.rows[0])
-    both[4 * CHAIR] = 200  # the chair beside the book: as near to either, and book's zone may be the other's
+def test_view_pulls_only_the_node_of_its_zone():
+    zones = learned(*KITCHENS)
+    knowledge = make_knowledge(zones)
     nodes = np.asarray(knowledge.method["nodes"][KITCHEN])
-    percept = Percept(
-        jnp.asarray(both), jnp.int32(0), jnp.int32(NO_ACTION), jnp.bool_(False), jnp.int32(0), jnp.int32(0)
-    )
-    note = update(TRACKER.init(knowledge), knowledge, percept)
-    zone = int(note.zone)
-    assert zone in (book, holding(learned(*KITCHENS), CHAIR))
-    # node + rate (seen - node): where a category was not in the zone, 0 + 0.25 (1 - 0).
-    expected = nodes.copy()
-    expected[zone] = [1.0 if nodes[zone, category] == 1 else 0.25 for category in (BOOK, CHAIR)] + [0.0]
-    np.testing.assert_allclose(note.nodes, expected)
+
+    # A view of book and chair is equally near to the zones of both, so either may be chosen.
+    row = np.array(PATH.rows[0])
+    row[4 * CHAIR] = 200
+    state = look(TRACKER.init(knowledge), knowledge, row, heading=0)
+    zone = int(state.zone)
+    assert zone in (holding(zones, BOOK), holding(zones, CHAIR))
+
+    # node + rate (view - node): 1 stays 1, and a category that was not in the zone gets 0 + 0.25 (1 - 0).
+    expected_nodes = nodes.copy()
+    for category in (BOOK, CHAIR):
+        expected_nodes[zone, category] = 1.0 if nodes[zone, category] == 1 else NODE_RATE
+    expected_nodes[zone, FRIDGE] = 0.0
+    np.testing.assert_allclose(state.nodes, expected_nodes)
 
 
-def test_the_room_type_is_what_was_seen_not_what_it_is():
-    """Kitchens show book and chair, bedrooms chair and fridge; the tracker is told of no room."""
-    pair = (((BOOK, CHAIR), "kitchen"), ((BOOK, CHAIR), "kitchen"), ((CHAIR, FRIDGE), "bedroom"))
-    knowledge = knowledge_of(*pair, zones=2)
-    note = TRACKER.init(knowledge)
-    assert note.room_type == KITCHEN  # two scenes in three
-    note = see(note, knowledge, 3)  # chair
-    assert note.room_type == KITCHEN
-    np.testing.assert_allclose(read_of(note, knowledge, BOOK).room_probs[jnp.array(ROOMS)], [2 / 3, 1 / 3], rtol=1e-5)
-    pulled = note.nodes
-    note = see(note, knowledge, 6)  # fridge: share 0.95 x 1/2 + 0.05 / 3 in bedrooms, 0.05 / 3 in kitchens
-    bedroom, kitchen = (0.475 + 0.05 / 3) / 3, 2 * (0.05 / 3) / 3
-    assert note.room_type == BEDROOM
-    reading = read_of(note, knowledge, FRIDGE)
-    np.testing.assert_allclose(reading.room_probs[BEDROOM], bedroom / (bedroom + kitchen), rtol=1e-5)
-    assert (reading.room_probs[jnp.array([1, 3, 4])] == 0).all()  # room types without scenes
-    # The bedroom's graph begins untouched, but for this view of its fridge.
-    np.testing.assert_allclose(note.nodes, knowledge.method["nodes"][BEDROOM], atol=1e-6)
-    assert (pulled != note.nodes).any()
-    assert see(note, knowledge, 3).room_type == BEDROOM  # the fridge is not forgotten
+def test_room_type_is_inferred_from_the_detected_categories():
+    """Kitchens show book and chair, bedrooms chair and fridge; no input of the tracker names the room type."""
+    training_scenes = (((BOOK, CHAIR), "kitchen"), ((BOOK, CHAIR), "kitchen"), ((CHAIR, FRIDGE), "bedroom"))
+    knowledge = make_knowledge(learned(*training_scenes, zones=2))
+    state = TRACKER.init(knowledge)
+    assert state.room_type == KITCHEN  # two scenes in three
+
+    # The chair is equally frequent in both room types and leaves the shares of the scenes.
+    state = look_from_cell(state, knowledge, 3)
+    assert state.room_type == KITCHEN
+    room_probs = read_state(state, knowledge, BOOK).room_probs
+    np.testing.assert_allclose(room_probs[jnp.array(ROOMS)], [2 / 3, 1 / 3], rtol=1e-5)
+    kitchen_nodes = state.nodes
+
+    # The fridge has the share 0.95 x 1/2 + 0.05 / 3 in bedrooms and 0.05 / 3 in kitchens.
+    state = look_from_cell(state, knowledge, 6)
+    assert state.room_type == BEDROOM
+    bedroom_weight = (0.475 + 0.05 / 3) / 3
+    kitchen_weight = 2 * (0.05 / 3) / 3
+    room_probs = read_state(state, knowledge, FRIDGE).room_probs
+    np.testing.assert_allclose(room_probs[BEDROOM], bedroom_weight / (bedroom_weight + kitchen_weight), rtol=1e-5)
+    assert (room_probs[jnp.array([1, 3, 4])] == 0).all()  # room types without scenes
+
+    # The bedroom's graph begins as learned, but for this view of its fridge.
+    np.testing.assert_allclose(state.nodes, knowledge.method["nodes"][BEDROOM], atol=1e-6)
+    assert (kitchen_nodes != state.nodes).any()
+
+    # The detected fridge is not forgotten.
+    assert look_from_cell(state, knowledge, 3).room_type == BEDROOM
 
 
-# What the network makes of it
+# The network
 
 
 SPEC = dataclasses.replace(tiny.SPEC, method=find_method("hoz"), method_sizes=())
+EQUAL_WEIGHTS = jnp.ones(K)
 
 
 @functools.cache
-def policy():
+def make_policy():
     return bind(SPEC, init_params(SPEC, jax.random.key(0)))
 
 
-def experience(reading, weights=None, cell=0, goal=FRIDGE):
-    module, row = policy().method, jnp.asarray(PATH.rows[cell * PER_CELL])
-    seen = unpack_features(row, jnp.int32(goal), RowFormat(K))
-    return module.encode(seen, policy().appearance.embedding[...], jnp.ones(K) if weights is None else weights, reading)
+def encode_experience(reading, layout_weights=EQUAL_WEIGHTS):
+    """Experience in the first cell of the corridor, where the goal is the fridge."""
+    policy = make_policy()
+    features = unpack_features(jnp.asarray(PATH.rows[0]), jnp.int32(FRIDGE), RowFormat(K))
+    return policy.method.encode(features, policy.appearance.embedding[...], layout_weights, reading)
 
 
-def reading_in(zones, goal=FRIDGE, cell=0):
-    knowledge = Knowledge(jnp.zeros(0), jax.tree.map(jnp.asarray, zones))
-    return read_of(see(TRACKER.init(knowledge), knowledge, cell), knowledge, goal)
+def read_first_cell(zones):
+    """The tracker's reading in the first cell of the corridor, where the goal is the fridge."""
+    knowledge = make_knowledge(zones)
+    state = look_from_cell(TRACKER.init(knowledge), knowledge, 0)
+    return read_state(state, knowledge, FRIDGE)
 
 
 @pytest.mark.slow
 def test_permuted_relations_change_the_experience_and_nothing_else_of_the_graph():
     bank = [corridor(BOOK, CHAIR, FRIDGE)]
-    zones, permuted = learn_zones(bank, NOTHING, 3), learn_permuted_zones(bank, NOTHING, 3)
+    zones = learn_zones(bank, NOTHING, 3)
+    permuted_zones = learn_permuted_zones(bank, NOTHING, 3)
     for name in ("nodes", "detected", "frequency"):
-        np.testing.assert_array_equal(zones[name], permuted[name])
-    assert indirect_share(zones, permuted["next_zone"]) == 2 / 6
-    # Each zone got the place of the one before it, loop and all: the graph is the same under other names.
-    loops, moved = (np.diagonal(graph["mixing"][KITCHEN]) for graph in (zones, permuted))
-    np.testing.assert_array_equal(moved, np.roll(loops, 1))
-    for a in range(3):
-        for b in range(3):
-            assert (permuted["next_zone"][KITCHEN, a, b] - zones["next_zone"][KITCHEN, a - 1, b - 1]) % 3 == 1
-    for name in ("mixing", "next_zone"):  # either alone
-        one = zones | {name: permuted[name]}
-        assert np.abs(experience(reading_in(zones)) - experience(reading_in(one))).max() > 1e-3
+        np.testing.assert_array_equal(zones[name], permuted_zones[name])
+    assert indirect_share(zones, permuted_zones["next_zone"]) == 2 / 6
+
+    # Each zone gets the edges of the zone before it, its loop included: the graph is equal up to the names of zones.
+    loops = np.diagonal(zones["mixing"][KITCHEN])
+    permuted_loops = np.diagonal(permuted_zones["mixing"][KITCHEN])
+    np.testing.assert_array_equal(permuted_loops, np.roll(loops, 1))
+    next_zone = zones["next_zone"][KITCHEN]
+    permuted_next_zone = permuted_zones["next_zone"][KITCHEN]
+    for start_zone in range(3):
+        for end_zone in range(3):
+            assert (permuted_next_zone[start_zone, end_zone] - next_zone[start_zone - 1, end_zone - 1]) % 3 == 1
+
+    # Either of the two relations changes the experience without the other one.
+    for name in ("mixing", "next_zone"):
+        changed_zones = zones | {name: permuted_zones[name]}
+        experience = encode_experience(read_first_cell(zones))
+        changed_experience = encode_experience(read_first_cell(changed_zones))
+        assert np.abs(experience - changed_experience).max() > 1e-3
 
 
-@pytest.mark.parametrize("place", range(3))
-def test_current_next_and_goal_zone_all_enter(place):
-    reading = reading_in(learned(*KITCHENS))
-    other = reading._replace(zone_rows=reading.zone_rows.at[place].add(1.0))
-    assert np.abs(experience(reading) - experience(other)).max() > 1e-4
+@pytest.mark.parametrize("zone_index", range(3))
+def test_current_next_and_goal_zone_all_enter_the_experience(zone_index):
+    reading = read_first_cell(learned(*KITCHENS))
+    changed_reading = reading._replace(zone_rows=reading.zone_rows.at[zone_index].add(1.0))
+    assert np.abs(encode_experience(reading) - encode_experience(changed_reading)).max() > 1e-4
 
 
 def test_layout_weights_multiply_the_zones_too():
-    """A category of weight 0 says the same whatever its entries in the zones are; others do not."""
-    reading = reading_in(learned(*KITCHENS))
-    wiped = jnp.ones(K).at[CHAIR].set(0.0)
-    maps = (policy().method.width - NUM_PRIORS) // K
-    for weights, same in ((wiped, True), (jnp.ones(K), False)):
-        expected = experience(reading, weights)
-        louder = ZoneReading(reading.room_probs, 3.0 * reading.zone_rows)
-        louder_result = experience(louder, weights)
-        chair = slice(CHAIR * maps, (CHAIR + 1) * maps)
-        assert np.array_equal(expected[chair], louder_result[chair]) == same
-        assert not np.array_equal(expected, louder_result)
-    np.testing.assert_array_equal(experience(reading)[-NUM_PRIORS:], reading.room_probs)
+    """The experience of a category of weight 0 does not depend on its entries in the zones; with weight 1 it does."""
+    reading = read_first_cell(learned(*KITCHENS))
+    tripled_reading = ZoneReading(reading.room_probs, 3.0 * reading.zone_rows)
+    outputs_per_category = (make_policy().method.width - NUM_PRIORS) // K
+    chair_outputs = slice(CHAIR * outputs_per_category, (CHAIR + 1) * outputs_per_category)
+
+    weights_without_chair = EQUAL_WEIGHTS.at[CHAIR].set(0.0)
+    for layout_weights, is_chair_equal in ((weights_without_chair, True), (EQUAL_WEIGHTS, False)):
+        experience = encode_experience(reading, layout_weights)
+        tripled_experience = encode_experience(tripled_reading, layout_weights)
+        assert np.array_equal(experience[chair_outputs], tripled_experience[chair_outputs]) == is_chair_equal
+        assert not np.array_equal(experience, tripled_experience)
+
+    # The probabilities of the room types follow the categories.
+    np.testing.assert_array_equal(encode_experience(reading)[-NUM_PRIORS:], reading.room_probs)

@@ -47,17 +47,17 @@ def released_experience(params, features, appearance, weights, *, is_transposed=
     multiplies the rows [appear | info | indicator] before the perceptron. The mistake `is_transposed=False` omits the
     last transposition.
     """
-    double = functools.partial(np.asarray, dtype=float)
+    to_float64 = functools.partial(np.asarray, dtype=float)
     edges, maps = params["edges"], params["maps"]
-    info = np.maximum(double(features.table) @ double(edges["kernel"]) + double(edges["bias"]), 0).T
+    info = np.maximum(to_float64(features.table) @ to_float64(edges["kernel"]) + to_float64(edges["bias"]), 0).T
     for kernel in params["mix"]:
-        info = np.maximum(info @ double(kernel), 0)
+        info = np.maximum(info @ to_float64(kernel), 0)
 
-    appear = features.visible[:, None] * double(appearance)
+    appear = features.visible[:, None] * to_float64(appearance)
     related = (appear.T @ info).T if is_transposed else info @ appear
     rows = weights[:, None] * np.hstack([related, features.table])
     for layer in (maps["inner"], maps["outer"]):
-        rows = np.maximum(rows @ double(layer["kernel"]) + double(layer["bias"]), 0)
+        rows = np.maximum(rows @ to_float64(layer["kernel"]) + to_float64(layer["bias"]), 0)
     return rows.ravel()
 
 
@@ -75,7 +75,7 @@ def package_and_reference(num_layers, **mistake):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("num_layers", [1, 4])
-def test_experience_is_that_of_the_released_equations(num_layers):
+def test_experience_equals_that_of_the_released_equations(num_layers):
     encoded, expected = package_and_reference(num_layers)
     scale = np.abs(expected).max()
     np.testing.assert_allclose(encoded, expected, atol=1e-5 * scale)
@@ -85,7 +85,7 @@ def test_experience_is_that_of_the_released_equations(num_layers):
     assert np.abs(encoded - mistaken).max() > 0.05 * scale
 
 
-def test_aggregation_by_hand():
+def test_aggregation_follows_worked_arithmetic():
     """Category i collects the appearance of category j with the factor R_ji.
 
     Only the feature `ahead` enters the edges: unit j holds e_j times `ahead` of category i, with e = (1, 0, 2). `ahead`

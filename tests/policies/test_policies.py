@@ -28,7 +28,7 @@ from jaxnav.store.export import export_params
 REPOSITORY = Path(__file__).parents[2]
 NUM_CATEGORIES = len(CATEGORIES)
 BATCH_SIZE = 12
-#: Weights of the layout that differ from one and from another.
+#: Layout weights that differ from 1 and from each other.
 LAYOUT_WEIGHTS = jnp.linspace(0.1, 1.6, BATCH_SIZE * NUM_CATEGORIES).reshape(BATCH_SIZE, NUM_CATEGORIES)
 
 
@@ -91,7 +91,7 @@ def test_batch_decides_as_its_single_members(policy):
     observation, memory = random_batch()
     pathways = policy.pathways(observation, LAYOUT_WEIGHTS)
     decision = policy.decide(pathways, memory)
-    assert float(decision.logits.std()) > 0.1  # lively, so that the comparison says something
+    assert float(decision.logits.std()) > 0.1  # logits that vary, so that the comparison is not trivial
     for index in range(BATCH_SIZE):
         single_pathways = policy.pathways(leaves_at(observation, index), LAYOUT_WEIGHTS[index])
         single_decision = policy.decide(single_pathways, leaves_at(memory, index))
@@ -131,7 +131,7 @@ def test_do_zeroes_scene_and_goal_and_keeps_experience(org):
     assert pathways.goal.any()
 
 
-def test_counterfactual_logits_depend_on_experience_memory_and_previous_action_alone(org):
+def test_counterfactual_logits_depend_only_on_experience_memory_and_previous_action(org):
     observation, memory = random_batch(0)
     other_observation, _ = random_batch(1)
     pathways = org.pathways(observation, LAYOUT_WEIGHTS)
@@ -157,7 +157,7 @@ def test_counterfactual_logits_depend_on_experience_memory_and_previous_action_a
         assert (np.abs(changed_logits - logits).max(axis=-1) > 1e-4).sum() > BATCH_SIZE / 2
 
 
-def test_layout_weights_change_experience_alone(org):
+def test_layout_weights_change_only_experience(org):
     observation, _ = random_batch()
     pathways = org.pathways(observation, jnp.ones((BATCH_SIZE, NUM_CATEGORIES)))
     weighted_pathways = org.pathways(observation, LAYOUT_WEIGHTS)
@@ -182,7 +182,7 @@ def test_layout_weights_have_no_gradient(org):
         return org.decide(org.pathways(observation, layout_weights), memory).logits[:, 0].sum()
 
     np.testing.assert_array_equal(jax.grad(loss)(LAYOUT_WEIGHTS), np.zeros((BATCH_SIZE, NUM_CATEGORIES)))
-    assert abs(float(loss(LAYOUT_WEIGHTS) - loss(2 * LAYOUT_WEIGHTS))) > 1e-3  # though the weights do matter
+    assert abs(float(loss(LAYOUT_WEIGHTS) - loss(2 * LAYOUT_WEIGHTS))) > 1e-3  # the logits do depend on the weights
 
 
 @pytest.mark.parametrize("method", params_by_tier(METHODS, fast=["org", "rgb"], slow=METHODS))
@@ -205,7 +205,7 @@ def test_rgb_has_no_experience():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
-def test_init_params_gives_nested_dicts_that_bind_takes_over(method):
+def test_init_params_returns_nested_dicts_that_bind_restores(method):
     spec = PolicySpec(method=find_method(method), num_categories=NUM_CATEGORIES, sizes=SIZES)
     params = init_params(spec, jax.random.key(3))
 
@@ -221,6 +221,8 @@ def test_init_params_gives_nested_dicts_that_bind_takes_over(method):
                 assert value.size > 0
 
     assert_plain_data(params)
+
+    # A network holds the parameters that it is bound to; they depend only on the key.
     chex.assert_trees_all_equal(nnx.to_pure_dict(nnx.state(bind(spec, params), nnx.Param)), params)
     chex.assert_trees_all_equal(init_params(spec, jax.random.key(3)), params)
     other_params = init_params(spec, jax.random.key(4))
@@ -228,7 +230,7 @@ def test_init_params_gives_nested_dicts_that_bind_takes_over(method):
     assert not all(jax.tree.leaves(same_leaves))
 
 
-# Says what was imported, then the logits of an exported policy.
+# Script that prints the imported modules and the logits of an exported policy.
 USE_EXPORT = """
 import json, sys
 from pathlib import Path
@@ -242,22 +244,26 @@ from jaxnav.policies.spec import PolicySpec
 from jaxnav.store.export import load_params
 from jaxnav.env.objectnav import Observation
 params, fields = load_params(Path(sys.argv[1]))
-bound = bind(PolicySpec.from_json(fields, ORG, fields["num_categories"]), params)
-given = np.load(sys.argv[2])
-observation = Observation(row=jnp.asarray(given["row"]), goal=jnp.asarray(given["goal"]))
-pathways = bound.pathways(PolicyInputs(observation, jnp.asarray(given["weights"])))
-decision = bound.decide(pathways, bound.initial_memory((len(given["goal"]),)))
+policy = bind(PolicySpec.from_json(fields, ORG, fields["num_categories"]), params)
+inputs = np.load(sys.argv[2])
+observation = Observation(row=jnp.asarray(inputs["row"]), goal=jnp.asarray(inputs["goal"]))
+pathways = policy.pathways(PolicyInputs(observation, jnp.asarray(inputs["weights"])))
+decision = policy.decide(pathways, policy.initial_memory((len(inputs["goal"]),)))
 print(json.dumps({"modules": sorted(sys.modules), "logits": decision.logits.tolist()}))
 """
 
 
 @pytest.mark.slow
 def test_exported_policy_decides_without_importing_the_trainer(tmp_path, org):
+    # Export a policy and use it in another process.
     export_params(tmp_path / "policy", random_params(0), SPEC.to_json() | {"num_categories": NUM_CATEGORIES})
     observation, _ = random_batch()
-    np.savez(tmp_path / "given.npz", row=observation.row, goal=observation.goal, weights=LAYOUT_WEIGHTS)
-    command = [sys.executable, "-c", USE_EXPORT, str(tmp_path / "policy"), str(tmp_path / "given.npz")]
-    output = json.loads(subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True).stdout)
+    np.savez(tmp_path / "inputs.npz", row=observation.row, goal=observation.goal, weights=LAYOUT_WEIGHTS)
+    command = [sys.executable, "-c", USE_EXPORT, str(tmp_path / "policy"), str(tmp_path / "inputs.npz")]
+    completed = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    output = json.loads(completed.stdout)
+
+    # Logits and imports.
     expected = org.decide(org.pathways(observation, LAYOUT_WEIGHTS), org.initial_memory((BATCH_SIZE,))).logits
     np.testing.assert_allclose(output["logits"], expected, rtol=1e-5, atol=1e-6)
     heavy_modules = {"matplotlib", "orbax", "tyro", "PIL", "jaxnav.training", "jaxnav.evaluation", "jaxnav.cli"}

@@ -1,4 +1,4 @@
-"""The trail of an episode: exactly the repeated poses are told, by compass, odometry and horizon."""
+"""The pose history of TPN: repeated poses are recognised by compass, odometry and horizon."""
 
 import dataclasses
 
@@ -21,25 +21,27 @@ from jaxnav.scenes.task import LOOK_DOWN, LOOK_UP, MOVE_AHEAD, NUM_ACTIONS, ROTA
 from jaxnav.scenes.worlds import WORLDS, make_generated_scenes
 
 
-def knowledge(bank=tiny.BANK):
+def make_knowledge(bank=tiny.BANK):
+    """The tiny world's priors with the motion of a bank's task."""
     return tiny.knowledge()._replace(method=jax.tree.map(jnp.asarray, learn_motion([bank], np.zeros(0))))
 
 
-def follow(walk, length=100):
-    """Which poses of a walk [(heading, action, moved, horizon)] are repeated."""
-    method_knowledge, tracker = knowledge(), PoseTracker(length)
+def repeated_poses(walk, length=100):
+    """True for the repeated poses of a walk, a list of (heading, action, moved, horizon)."""
+    knowledge = make_knowledge()
+    tracker = PoseTracker(length)
     columns = tuple(jnp.asarray(column) for column in zip(*walk, strict=True))
 
-    def step(note, inputs):
+    def step(state, inputs):
         heading, action, moved, horizon = inputs
         percept = Percept(jnp.zeros(0, jnp.uint8), heading, action, moved, horizon, jnp.int32(0))
-        note = tracker.update(note, method_knowledge, percept)
-        return note, tracker.read(note, method_knowledge, jnp.int32(0))
+        state = tracker.update(state, knowledge, percept)
+        return state, tracker.read(state, knowledge, jnp.int32(0))
 
-    return jax.lax.scan(step, tracker.init(method_knowledge), columns)[1].tolist()
+    return jax.lax.scan(step, tracker.init(knowledge), columns)[1].tolist()
 
 
-def test_a_walk_repeats_the_poses_that_it_comes_back_to():
+def test_poses_to_which_a_walk_returns_are_repeated():
     walk = [
         ((0, NO_ACTION, False, 0), False),
         ((1, ROTATE_RIGHT, False, 0), False),
@@ -51,49 +53,57 @@ def test_a_walk_repeats_the_poses_that_it_comes_back_to():
         ((0, MOVE_AHEAD, False, 0), True),  # blocked
         ((1, ROTATE_RIGHT, False, 0), False),
         ((1, MOVE_AHEAD, True, 0), False),  # diagonally
-        *(((heading, ROTATE_RIGHT, False, 0), False) for heading in (2, 3, 4, 5)),
-        ((5, MOVE_AHEAD, True, 0), False),  # there again, but with another heading
-        *(((heading, ROTATE_RIGHT, False, 0), False) for heading in (6, 7)),
+        ((2, ROTATE_RIGHT, False, 0), False),
+        ((3, ROTATE_RIGHT, False, 0), False),
+        ((4, ROTATE_RIGHT, False, 0), False),
+        ((5, ROTATE_RIGHT, False, 0), False),
+        ((5, MOVE_AHEAD, True, 0), False),  # the cell of the turn above, but with another heading
+        ((6, ROTATE_RIGHT, False, 0), False),
+        ((7, ROTATE_RIGHT, False, 0), False),
         ((0, ROTATE_RIGHT, False, 0), True),
     ]
-    assert follow([step for step, _ in walk]) == [repeated for _, repeated in walk]
+    assert repeated_poses([step for step, _ in walk]) == [is_repeated for _, is_repeated in walk]
 
 
-def test_what_is_too_long_ago_is_forgotten():
+def test_poses_beyond_the_length_of_the_history_are_forgotten():
     turns = [(heading % 8, ROTATE_RIGHT, False, 0) for heading in range(17)]
-    assert follow(turns) == 8 * [False] + 9 * [True]
-    assert follow(turns, 8) == 8 * [False] + 9 * [True]
-    assert not any(follow(turns, 7))
+    assert repeated_poses(turns) == 8 * [False] + 9 * [True]
+    assert repeated_poses(turns, 8) == 8 * [False] + 9 * [True]
+    assert not any(repeated_poses(turns, 7))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("world", ["rooms", "apartments", "houses"])
-def test_exactly_the_repeated_poses_of_random_walks_are_told(world):
-    """With 8 and 12 headings, 2 horizons and 1, and walks longer than what is remembered."""
-    task, walks, steps = WORLDS[world].task, 32, 300
+def test_exactly_the_repeated_poses_of_random_walks_are_recognised(world):
+    """Tasks have 8 or 12 headings and 1 or 2 horizons; walks are longer than the history."""
+    task = WORLDS[world].task
+    num_walks = 32
+    num_steps = 300
     bank = compile_bank([make_generated_scenes(world, "train", 1)[0]], task)
     env, params = build_environment(bank, {}, 10**6)
-    episodes = draw_episodes(bank, walks, seed=0)
-    acting = AgentLoop(
-        env, dataclasses.replace(tiny.SPEC, method=find_method("tpn"), num_categories=len(task.categories))
-    )
-    method_knowledge = knowledge(bank)
+    episodes = draw_episodes(bank, num_walks, seed=0)
+    spec = dataclasses.replace(tiny.SPEC, method=find_method("tpn"), num_categories=len(task.categories))
+    agent_loop = AgentLoop(env, spec)
+    knowledge = make_knowledge(bank)
 
     @jax.jit
     def walk(key):
-        # Half of them look down, where one can.
-        start = acting.start_from(start_states(episodes), None, method_knowledge, params)
+        # About half of the agents look down at the start, if the task has a second horizon.
+        start = agent_loop.start_from(start_states(episodes), None, knowledge, params)
 
         def step(agent, key):
-            draw = jax.random.randint(key, (walks,), 0, NUM_ACTIONS - 1)
-            agent, _ = acting.step(agent, jnp.where(draw % 2 == 0, MOVE_AHEAD, draw), method_knowledge, params)
-            return agent, (agent.state.pose, acting.policy_inputs(agent, method_knowledge, params).reading)
+            # Of ten actions, six are moves ahead; each turn and each look is one, and none is Done.
+            random_action = jax.random.randint(key, (num_walks,), 0, 2 * (NUM_ACTIONS - 1))
+            action = jnp.where(random_action < NUM_ACTIONS - 1, random_action, MOVE_AHEAD)
+            agent, _ = agent_loop.step(agent, action, knowledge, params)
+            return agent, (agent.state.pose, agent_loop.policy_inputs(agent, knowledge, params).reading)
 
-        _, (poses, repeated) = jax.lax.scan(step, start, jax.random.split(key, steps))
-        return jnp.concatenate([start.state.pose[None], poses]), repeated
+        _, (poses, is_repeated) = jax.lax.scan(step, start, jax.random.split(key, num_steps))
+        return jnp.concatenate([start.state.pose[None], poses]), is_repeated
 
-    poses, repeated = jax.tree.map(np.asarray, walk(jax.random.key(0)))
-    for now in range(1, steps + 1):
-        before = poses[max(0, now - PoseTracker().length) : now]
-        np.testing.assert_array_equal(repeated[now - 1], (before == poses[now]).any(axis=0))
-    assert 0.1 < repeated.mean() < 0.9
+    # A pose is repeated if it is among those that the history holds.
+    poses, is_repeated = jax.tree.map(np.asarray, walk(jax.random.key(0)))
+    for step_index in range(1, num_steps + 1):
+        history = poses[max(0, step_index - PoseTracker().length) : step_index]
+        np.testing.assert_array_equal(is_repeated[step_index - 1], (history == poses[step_index]).any(axis=0))
+    assert 0.1 < is_repeated.mean() < 0.9
