@@ -1,4 +1,4 @@
-"""Adaptation within an episode in plain NumPy, on whole kernels instead of factors."""
+"""Adaptation within an episode in plain NumPy, with changes of full kernels instead of products of low rank."""
 
 from typing import Any
 
@@ -23,7 +23,7 @@ from twins.transformer import residual_perceptron
 WINDOW = 6
 NUM_STEPS = 4
 LAYERS = ("fuse", "input_gates", "hidden_gates", "actor")
-TINY = 1e-30  # of a complex step: its square is nothing beside 1
+STEP_SIZE = 1e-30  # of a complex step, so small that its square vanishes beside 1
 
 
 class TwinTentative(TwinMethod):
@@ -34,9 +34,9 @@ class TwinTentative(TwinMethod):
 
     def update(self, features: Any, percept: Any) -> None:
         step = self.knowledge["steps"][int(percept.heading)]
-        last_place = np.array(self.poses[-1][0] if self.poses else (0, 0))
-        place = tuple((last_place + step * bool(percept.moved)).tolist())
-        pose = (place, int(percept.heading), int(percept.horizon))
+        last_cell = np.array(self.poses[-1][0] if self.poses else (0, 0))
+        cell = tuple((last_cell + step * bool(percept.moved)).tolist())
+        pose = (cell, int(percept.heading), int(percept.horizon))
         self.is_repeated = pose in self.poses
         self.poses.append(pose)
 
@@ -44,7 +44,7 @@ class TwinTentative(TwinMethod):
         return self.is_repeated
 
     def initial_fast(self, params: Params) -> Any:
-        """Return the states and actions of the episode, none yet, and the change of the actor's kernel."""
+        """Return the states and actions of the episode, initially none, and the change of the actor's kernel."""
         return [], [], np.zeros((params["actor"]["kernel"].shape[0] + 1, NUM_ACTIONS))
 
     def layer_changes(self, fast: Any) -> LayerChanges:
@@ -64,25 +64,27 @@ class TwinTentative(TwinMethod):
         network = params["method"]["tentative"]
         change = self.layer_changes(memory.fast)["actor"]
 
-        # All states of the episode, the present one at the end, and the actions between them.
+        # All states of the episode up to the present state, and the actions between them.
         state = residual_perceptron(network["state"], hidden)
         states = [*memory.fast[0], state]
         actions = list(memory.fast[1])
         if memory.action < NUM_ACTIONS:
             actions.append(memory.action)
 
-        # Read the trials whose first states are most like the present one.
+        # Read the ten trials, of the last hundred, whose first states are most like the present state.
         answer = np.zeros(len(state) + NUM_ACTIONS)
         if actions:
             keys, values = self.trials(states, actions)
             scores = self.scores(keys[-100:], state)
-            likeliest = np.argsort(-scores)[:10]
-            answer = softmax(scores[likeliest]) @ values[-100:][likeliest]
+            best_trials = np.argsort(-scores)[:10]
+            answer = softmax(scores[best_trials]) @ values[-100:][best_trials]
 
-        # Where the agent was before, the policy moves towards the expert's action.
+        # The tentative policy names the expert's action.
         experience = residual_perceptron(network["trial"], answer)
-        both = residual_perceptron(network["both"], np.concatenate([state, experience]))
-        expert_action = one_hot(int(linear(network["expert"], both).argmax()), NUM_ACTIONS)
+        expert_inputs = residual_perceptron(network["both"], np.concatenate([state, experience]))
+        expert_action = one_hot(int(linear(network["expert"], expert_inputs).argmax()), NUM_ACTIONS)
+
+        # At a repeated pose, the policy moves towards this action.
         if reading:
             change = change + 0.1 * np.outer(append_one(hidden), expert_action - softmax(logits))
         return states, actions, change
@@ -90,8 +92,8 @@ class TwinTentative(TwinMethod):
     def trials(self, states: list[np.ndarray], actions: list[int]) -> tuple[np.ndarray, np.ndarray]:
         """Return keys s_i and values [s_{i+1}, a_i] of all trials, as the released `states_rep` and memories."""
         keys = np.array(states[:-1])
-        taken_actions = np.eye(NUM_ACTIONS)[actions]
-        return keys, np.hstack([np.array(states[1:]), taken_actions])
+        action_rows = np.eye(NUM_ACTIONS)[actions]
+        return keys, np.hstack([np.array(states[1:]), action_rows])
 
     def scores(self, keys: np.ndarray, state: np.ndarray) -> np.ndarray:
         """Return the dot products of the keys with the present state."""
@@ -101,11 +103,11 @@ class TwinTentative(TwinMethod):
 class TwinLearnedSteps(TwinMethod):
     """Descent of the learned loss every six decisions (`savn`).
 
-    The gradient of the loss by the outputs of the layers is taken by complex steps, all in one batch.
+    Complex steps, all in one batch, compute the gradient of the loss with respect to the outputs of the layers.
     """
 
     def initial_fast(self, params: Params) -> Any:
-        """Return the steps of the episode, none yet, and the changes of the layers."""
+        """Return the steps of the episode, initially none, and the changes of the layers."""
         return [], dict.fromkeys(LAYERS, 0.0)
 
     def layer_changes(self, fast: Any) -> LayerChanges:
@@ -125,7 +127,7 @@ class TwinLearnedSteps(TwinMethod):
         if len(steps) % WINDOW or len(steps) > NUM_STEPS * WINDOW:
             return steps, changes
 
-        # A window is full: one step down the gradient of the loss.
+        # After a full window, take one step down the gradient of the loss.
         window = steps[-WINDOW:]
         gradient = self._output_gradient(params, window, changes)
         layer_inputs = self._layer_inputs(params, window, changes)
@@ -135,15 +137,16 @@ class TwinLearnedSteps(TwinMethod):
         return steps, next_changes
 
     def _output_gradient(self, params: Params, window: list, changes: LayerChanges) -> LayerChanges:
-        """Return the gradient of the loss by the outputs of the layers, [W, N] each."""
-        # One member of the batch for each output of each layer at each decision: there it moves by a complex step.
+        """Return the gradient of the loss with respect to the outputs of the layers, [W, N] each."""
+        # The batch has a member for each output of each layer at each decision, and changes it by a complex step.
         num_hidden = len(window[0][1])
         widths = np.array([num_hidden, 3 * num_hidden, 3 * num_hidden, NUM_ACTIONS])
         layer_ends = np.cumsum(widths)[:-1]
         batch_size = WINDOW * widths.sum()
-        steps = 1j * TINY * np.eye(batch_size).reshape(batch_size, WINDOW, -1)
-        layer_steps = np.split(steps, layer_ends, axis=-1)
+        complex_steps = 1j * STEP_SIZE * np.eye(batch_size).reshape(batch_size, WINDOW, -1)
+        layer_steps = np.split(complex_steps, layer_ends, axis=-1)
 
+        # Run the window again with the steps added to the outputs.
         entries = []
         state = np.broadcast_to(window[0][1], (batch_size, num_hidden))
         for time, (inputs, _) in enumerate(window):
@@ -151,8 +154,9 @@ class TwinLearnedSteps(TwinMethod):
             logits, state = run_stream(params, inputs, state, changes, output_changes)
             entries.append(np.concatenate([state, softmax(logits)], axis=-1))
 
+        # The imaginary part of the loss is the derivative times the size of the step.
         loss = _learned_loss(params["method"]["learned_loss"], np.stack(entries, axis=-1))
-        gradient = (np.imag(loss) / TINY).reshape(WINDOW, -1)
+        gradient = (np.imag(loss) / STEP_SIZE).reshape(WINDOW, -1)
         return dict(zip(LAYERS, np.split(gradient, layer_ends, axis=-1), strict=True))
 
     @staticmethod
@@ -173,10 +177,10 @@ class TwinLearnedSteps(TwinMethod):
 
 
 def _learned_loss(params: Params, entries: np.ndarray) -> np.ndarray:
-    """Return the length of two causal convolutions along entries [B, L, W]."""
+    """Return the Euclidean norm of two causal convolutions along entries [B, L, W], which is [B]."""
     for name, distance in (("first", 1), ("second", 2)):
-        earlier = np.zeros_like(entries)
-        earlier[:, distance:] = entries[:, :-distance]
-        values = linear(params[name], np.concatenate([earlier, entries], axis=-1))
+        shifted_entries = np.zeros_like(entries)
+        shifted_entries[:, distance:] = entries[:, :-distance]
+        values = linear(params[name], np.concatenate([shifted_entries, entries], axis=-1))
         entries = np.where(np.real(values) > 0, values, 0.01 * values)
     return np.sqrt((entries**2).sum(axis=(-2, -1)) + 1e-12)

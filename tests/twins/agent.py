@@ -11,7 +11,7 @@ from jaxnav.scenes.tables.compile import Bank
 
 
 class TwinTrace(NamedTuple):
-    """Layout weights, gap and both decisions of one step."""
+    """Layout weights, gap, and the factual and counterfactual decision of one step."""
 
     layout_weights: np.ndarray
     gap: float
@@ -19,7 +19,7 @@ class TwinTrace(NamedTuple):
     removed_logits: np.ndarray
 
     def action_logits(self, variant: str, epsilon: float | None, form: str | None) -> tuple[np.ndarray, float]:
-        """Return the logits of equation 1 (`tde`) or 2 (`stde`), and the weight of the removed ones."""
+        """Return the logits of equation 1 (`tde`) or 2 (`stde`), and the weight of the removed logits."""
         if variant == "tde":
             return self.factual_logits - self.removed_logits, 1.0
         s = 0.0 if epsilon is None else max(self.gap - epsilon, 0.0)
@@ -41,6 +41,7 @@ class TwinEpisode:
         self.counts_instances = bank.task.instance_counts
         belief_type = TwinPaperBelief if self.counts_instances else TwinBelief
         self.belief = None if prior is None else belief_type(prior)
+
         self.map = TwinMap()
         self.memory = policy.initial_memory()
         self.action = NUM_ACTIONS
@@ -48,7 +49,7 @@ class TwinEpisode:
         policy.method.begin()
 
     def infer(self) -> TwinTrace:
-        """Perceive the present view, once, and decide."""
+        """Perceive the present view and decide; call this once per step."""
         rules = self.bank.task.rules
         num_categories = len(self.bank.task.categories)
         row = self.bank.rows[self.pose]
@@ -69,15 +70,16 @@ class TwinEpisode:
         self.policy.method.update(features, percept)
 
         # Layout weights and gap.
-        layout = np.ones(num_categories)
+        layout_weights = np.ones(num_categories)
         gap = 0.0
         if self.belief is not None:
-            self.belief.update(unpack_counts(row, num_categories) if self.counts_instances else features.visible > 0)
-            layout = self.belief.weights(self.goal)
+            visible = unpack_counts(row, num_categories) if self.counts_instances else features.visible > 0
+            self.belief.update(visible)
+            layout_weights = self.belief.weights(self.goal)
             gap = self.belief.gap
 
-        self.decision = self.policy.decide(features, self.map.inputs(), layout, self.memory)
-        return TwinTrace(layout, gap, self.decision.factual, self.decision.counterfactual)
+        self.decision = self.policy.decide(features, self.map.inputs(), layout_weights, self.memory)
+        return TwinTrace(layout_weights, gap, self.decision.factual, self.decision.counterfactual)
 
     def step(self, action: int) -> None:
         """Take an action after `infer`."""

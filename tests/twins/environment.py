@@ -1,6 +1,6 @@
 """An ObjectNav episode in plain Python, from docs/environment.md alone.
 
-It shares no arithmetic with the compiled environment; the best length is that of a breadth-first search over poses.
+The twin shares no arithmetic with the compiled environment; best lengths come from a breadth-first search over poses.
 """
 
 import math
@@ -44,7 +44,7 @@ class Twin:
         self.goal = goal
         self.step_limit = step_limit
         self.steps = 0
-        self.over = False
+        self.is_over = False
         self.pose: Pose = (*cell, heading, horizon)
         self.start = self.pose
 
@@ -65,17 +65,17 @@ class Twin:
 
     def step(self, action: int) -> tuple[float, bool, bool]:
         """Take an action; return the reward, `terminated` and `truncated`."""
-        if self.over:
+        if self.is_over:
             raise RuntimeError("the episode is over")
         self.steps += 1
         terminated = action == DONE
         truncated = self.steps >= self.step_limit and not terminated
-        self.over = terminated or truncated
+        self.is_over = terminated or truncated
         reward = 5.0 if terminated and self.goal in self.successes() else -0.01
-        self.pose = self._moved(self.pose, action)
+        self.pose = self._next_pose(self.pose, action)
         return reward, terminated, truncated
 
-    def _moved(self, pose: Pose, action: int) -> Pose:
+    def _next_pose(self, pose: Pose, action: int) -> Pose:
         iz, ix, heading, horizon = pose
         if action == MOVE_AHEAD:
             dz, dx = neighbour(self.rules, heading)
@@ -94,15 +94,15 @@ class Twin:
 
         The list is empty for a category that is not detected, and has several entries where instances are equally near.
         """
-        nearest = []
-        for rows in self._instances_in_view():
-            min_distance = min((row[0] for row in rows), default=math.inf)
-            nearest.append([row[1:] for row in rows if row[0] <= min_distance + 1e-9])
-        return nearest
+        detections = []
+        for instances in self._instances_in_view():
+            min_distance = min((instance[0] for instance in instances), default=math.inf)
+            detections.append([instance[1:] for instance in instances if instance[0] <= min_distance + 1e-9])
+        return detections
 
     def instance_counts(self) -> list[int]:
         """Return the number of instances that a detector without errors detects of each category."""
-        return [len(rows) for rows in self._instances_in_view()]
+        return [len(instances) for instances in self._instances_in_view()]
 
     def _instances_in_view(self) -> list[list[tuple[float, float, float, float]]]:
         """Return (distance, ahead, right, apparent size) of the instances in view, by category."""
@@ -110,7 +110,8 @@ class Twin:
         for box, distance in self.scene.detectable(self.cell):
             ahead, right, in_view = self.scene.offsets(self.cell, self.heading, self.horizon, box)
             if in_view and box.category is not None:
-                instances[box.category].append((distance, ahead, right, box.size / max(distance, 0.25)))
+                apparent_size = box.size / max(distance, 0.25)
+                instances[box.category].append((distance, ahead, right, apparent_size))
         return instances
 
     def view(self) -> list[int]:
@@ -141,7 +142,7 @@ class Twin:
             if self._succeeds(pose, self.goal):
                 return lengths[pose]
             for action in range(DONE):
-                next_pose = self._moved(pose, action)
+                next_pose = self._next_pose(pose, action)
                 if next_pose not in lengths:
                     lengths[next_pose] = lengths[pose] + 1
                     queue.append(next_pose)
@@ -168,9 +169,10 @@ def start_twin(
     return Twin(scene, CATEGORIES, rules, goal, cell, heading, horizon, step_limit)
 
 
-def start_in_one_cell(*objects: DrawnObject, walls: Iterable[Cell] = (), **start: Any) -> Twin:
+def start_in_one_cell(*objects: DrawnObject, walls: Iterable[Cell] = (), **start_options: Any) -> Twin:
     """Start an episode in a lattice of 16 x 4 cells, of which only [0, 0] is standable."""
-    return start_twin(draw([".###"] + ["####"] * 15, *objects, walls=walls), **start)
+    scene = draw([".###"] + ["####"] * 15, *objects, walls=walls)
+    return start_twin(scene, **start_options)
 
 
 def detected_categories(twin: Twin) -> set[int]:

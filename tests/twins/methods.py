@@ -1,7 +1,7 @@
 """The experience of every method in plain NumPy.
 
-Not twinned are the map and the planner of `semexp`: they are the package's here, and tests/policies holds their
-references.
+The map and the planner of `semexp` have no twin: `BorrowedMap` uses those of the package, and tests/policies compares
+them with references.
 """
 
 import functools
@@ -31,7 +31,7 @@ from jaxnav.policies.methods import METHODS
 
 
 class TwinAnonymous(TwinMethod):
-    """The goal's own detection, without a name (`anonymous`)."""
+    """The detection of the goal alone, without the category's name (`anonymous`)."""
 
     def perceive(self, features: TwinFeatures) -> TwinFeatures:
         goal = int(features.goal.argmax())
@@ -69,9 +69,10 @@ class TwinRelations(TwinMethod):
     ) -> np.ndarray:
         """Return the maps of the rows [R^T X | table], each times its weight."""
         relations = self.relations(params, features)
-        seen_appearance = features.visible[:, None] * appearance
-        related_appearance = self.aggregate(relations, seen_appearance)
-        return category_maps(params["maps"], self.weigh(weights, np.hstack([related_appearance, table])))
+        visible_appearance = features.visible[:, None] * appearance
+        related_appearance = self.aggregate(relations, visible_appearance)
+        weighted_rows = self.weigh(weights, np.hstack([related_appearance, table]))
+        return category_maps(params["maps"], weighted_rows)
 
     def relations(self, params: Params, features: TwinFeatures) -> np.ndarray:
         """Return R [K, K], mixed over the categories of the second axis."""
@@ -100,7 +101,7 @@ class TwinZones(TwinRelations):
         self.nodes = graph["nodes"][self.room].copy()
 
     def update(self, features: TwinFeatures, percept: Any) -> None:
-        # The likeliest room; its zones start from those learned before.
+        # The likeliest room. When it changes, the zones start again from those learned before training.
         self.detected |= features.visible > 0
         room = int(self._room_log_odds().argmax())
         if room != self.room:
@@ -155,7 +156,7 @@ class TwinGraph(TwinMethod):
 
 
 class TwinAttention(TwinMethod):
-    """Attention by cosines, asked by goal, action and memory (`eotp`)."""
+    """Attention by cosines; goal, action and memory make the query (`eotp`)."""
 
     def encode(
         self,
@@ -179,18 +180,18 @@ class TwinAttention(TwinMethod):
         for share, part in zip(shares, (goal_part, action_part, memory_part), strict=True):
             query += share * _direction(part)
 
-        # Attention over the goal and what is visible, by cosines.
-        attended = np.flatnonzero(features.visible + features.goal)
-        scores = [_direction(rows[category]) @ query for category in attended]
+        # Attention over the goal and the visible categories, by cosines.
+        key_categories = np.flatnonzero(features.visible + features.goal)
+        scores = [_direction(rows[category]) @ query for category in key_categories]
         attention = np.zeros(len(rows))
-        attention[attended] = softmax(np.array(scores))
+        attention[key_categories] = softmax(np.array(scores))
 
         values = relu(rows) @ maps["outer"]["kernel"]
         return relu((attention * weights)[:, None] * values + maps["outer"]["bias"]).ravel()
 
 
 class BorrowedMap(TwinMethod):
-    """Map and planner of the package (`semexp`); the network is twinned."""
+    """Map and planner of the package with a twin of the network (`semexp`)."""
 
     def __init__(self, knowledge: Knowledge):
         method = METHODS["semexp"]
@@ -223,7 +224,7 @@ class BorrowedMap(TwinMethod):
         reading: Any,
         memory: TwinMemory,
     ) -> np.ndarray:
-        # Each block holds the weighted appearances of its categories, and that of the goal.
+        # Each block holds the sum of the weighted appearances of its categories, and the appearance of the goal.
         goal_appearance = features.goal @ appearance
         blocks = []
         for bits in reading.blocks.tolist():
@@ -237,6 +238,7 @@ class BorrowedMap(TwinMethod):
 
 
 def _direction(vector: np.ndarray) -> np.ndarray:
+    """Return the unit vector in the direction of a vector."""
     return vector / math.sqrt((vector**2).sum() + 1e-12)
 
 

@@ -1,6 +1,7 @@
-"""The perception of an agent in plain NumPy: features, the belief about the layout, the map of visited places.
+"""The perception of an agent in plain NumPy: features, the belief about the layout, the map of visited cells.
 
-From docs/environment.md and docs/specification.md; float64 throughout, and no arithmetic of the package.
+The twin follows docs/environment.md and docs/specification.md, and computes in float64 with no arithmetic of the
+package.
 """
 
 import math
@@ -15,7 +16,7 @@ UNKNOWN, BLOCKED, FREE, VISITED = range(4)
 
 
 class TwinFeatures(NamedTuple):
-    """A view as the networks get it.
+    """A view as the input of the networks.
 
     Attributes:
       view: float64 [242], flags of standable cells, then of those that are not standable.
@@ -47,16 +48,17 @@ def unpack_row(row: np.ndarray, goal: int, num_categories: int) -> TwinFeatures:
 
     table = np.zeros((num_categories, 9))
     for category, entry in enumerate(row[: 4 * num_categories].reshape(-1, 4).tolist()):
-        confidence, ahead_byte, right_byte, size_byte = entry
-        if confidence:
+        confidence_byte, ahead_byte, right_byte, size_byte = entry
+        if confidence_byte:
             # Metres from the bytes, and the bearing as sine and cosine.
             ahead = ahead_byte / 51
             right = (right_byte - 128) / 25.4
             distance = math.hypot(ahead, right)
             safe_distance = max(distance, 0.05)
-            offsets = ahead / 5, right / 5, distance / 5
-            bearing = right / safe_distance, ahead / safe_distance
-            table[category, :8] = 1, confidence / 255, *offsets, *bearing, size_byte / 127.5
+            offsets = (ahead / 5, right / 5, distance / 5)
+            bearing = (right / safe_distance, ahead / safe_distance)
+            table[category, :8] = (1, confidence_byte / 255, *offsets, *bearing, size_byte / 127.5)
+
     table[goal, 8] = 1
     return TwinFeatures(view, table[:, 0].copy(), table, table[:, 8].copy())
 
@@ -71,7 +73,7 @@ class TwinBelief:
 
     def update(self, visible: np.ndarray) -> None:
         """Update with the categories that are visible, bool [K]."""
-        # The gate is shut: the gap decays.
+        # Fewer than two, or unchanged, categories shut the gate, and the gap decays.
         if visible.sum() < 2 or (visible == self.last_visible).all():
             self.gap *= 0.8
             return
@@ -79,16 +81,16 @@ class TwinBelief:
         # Eq. 5: the mean divergence of the rows of visible categories, each without its own entry.
         divergences = []
         for i in np.flatnonzero(visible):
-            others = np.arange(len(visible)) != i
-            prior_row = self.alpha[i, others]
-            counts = visible[others].astype(float)
-            divergences.append(_kl(prior_row + counts, prior_row))
-            self.alpha[i, others] += counts
+            other_columns = np.arange(len(visible)) != i
+            prior_row = self.alpha[i, other_columns]
+            counts = visible[other_columns].astype(float)
+            divergences.append(_dirichlet_kl(prior_row + counts, prior_row))
+            self.alpha[i, other_columns] += counts
         self.gap = math.tanh(np.mean(divergences))
         self.last_visible = visible.copy()
 
     def weights(self, goal: int) -> np.ndarray:
-        """Return the column of w, [K]: the expectation that the goal is where each category is seen."""
+        """Return the goal's column of w, [K]: the expected probability to see the goal with each category."""
         weights = self.alpha[:, goal] / self.alpha.sum(axis=1)
         weights[goal] = 1.0
         return weights
@@ -101,20 +103,20 @@ class TwinPaperBelief(TwinBelief):
         """Update with the number of visible instances of each category, [K]."""
         divergences = []
         for i in range(len(visible)):
-            others = np.arange(len(visible)) != i  # n_{-i}, and the row without its own entry
-            prior_row = self.alpha[i, others]
-            divergences.append(_kl(prior_row + visible[others], prior_row))
-            self.alpha[i, others] += visible[others]
+            other_columns = np.arange(len(visible)) != i  # n_{-i}, and the row without its own entry
+            prior_row = self.alpha[i, other_columns]
+            divergences.append(_dirichlet_kl(prior_row + visible[other_columns], prior_row))
+            self.alpha[i, other_columns] += visible[other_columns]
         self.gap = math.tanh(sum(divergences) / len(visible))
 
 
 def unpack_counts(row: np.ndarray, num_categories: int) -> np.ndarray:
-    """Return the instance counts of a row that holds them, float64 [K]: one byte each, right behind the view."""
+    """Return the instance counts of a row that holds them, float64 [K]; their bytes follow the view."""
     first_byte = 4 * num_categories + 31
     return row[first_byte : first_byte + num_categories].astype(float)
 
 
-def _kl(b: np.ndarray, a: np.ndarray) -> float:
+def _dirichlet_kl(b: np.ndarray, a: np.ndarray) -> float:
     """Return KL(Dir(b) || Dir(a)) in nats."""
     return float(
         gammaln(b.sum()) - gammaln(b).sum() - gammaln(a.sum()) + gammaln(a).sum()
@@ -139,10 +141,10 @@ class TwinMap:
         if moved:
             self.position = self._cell_at(ahead=1, right=0)
 
-        for number, cell in enumerate(cells):
-            state = {STANDABLE: FREE, NOT_STANDABLE: BLOCKED}.get(cell, UNKNOWN)
-            place = self._cell_at(number // 11, number % 11 - 5)
-            self.cell_states[place] = max(self.cell_states.get(place, UNKNOWN), state)
+        for index, view_cell in enumerate(cells):
+            state = {STANDABLE: FREE, NOT_STANDABLE: BLOCKED}.get(view_cell, UNKNOWN)
+            map_cell = self._cell_at(ahead=index // 11, right=index % 11 - 5)
+            self.cell_states[map_cell] = max(self.cell_states.get(map_cell, UNKNOWN), state)
         self.cell_states[self.position] = VISITED
 
     def inputs(self) -> np.ndarray:

@@ -1,7 +1,7 @@
 """The policies' decisions in plain NumPy: pathways, streams, the counterfactual.
 
-Float64, one episode, no arithmetic of the package; parameters are the nested dicts of `init_params`. A `TwinMethod`
-holds the part in which methods differ.
+A twin computes in float64, one episode at a time, with no arithmetic of the package. Parameters are the nested dicts of
+`init_params`. A `TwinMethod` holds the part in which methods differ.
 """
 
 from typing import Any, NamedTuple
@@ -33,7 +33,7 @@ class TwinMemory(NamedTuple):
 
 
 class TwinDecision(NamedTuple):
-    """Factual and counterfactual logits [A], and the memory, whose action is filled in later."""
+    """Factual and counterfactual logits [A], and the memory after the decision, whose action is set later."""
 
     factual: np.ndarray
     counterfactual: np.ndarray
@@ -41,7 +41,7 @@ class TwinDecision(NamedTuple):
 
 
 class TwinMethod:
-    """Method without experience, `rgb`. Subclasses override the parts that they have."""
+    """A method without experience (`rgb`). Subclasses override the parts in which they differ."""
 
     def __init__(self, knowledge: Knowledge):
         self.knowledge = {name: np.asarray(value) for name, value in knowledge.method.items()}
@@ -50,7 +50,7 @@ class TwinMethod:
         """Start an episode."""
 
     def perceive(self, features: TwinFeatures) -> TwinFeatures:
-        """Return the features that the networks get."""
+        """Return the features that the networks read."""
         return features
 
     def update(self, features: TwinFeatures, percept: Any) -> None:
@@ -96,12 +96,12 @@ class TwinMethod:
         """Return the fast weights after a decision.
 
         Args:
-          params: of the policy.
-          inputs: of the direct stream.
-          memory: before the decision.
-          logits: of the decision.
+          params: parameters of the policy.
+          inputs: inputs of the direct stream.
+          memory: memory before the decision.
+          logits: logits of the decision.
           hidden: recurrent state of the direct stream after the decision.
-          reading: of the tracker.
+          reading: reading of the tracker.
         """
         return memory.fast
 
@@ -152,22 +152,22 @@ def run_stream(
     """Return logits and the recurrent state after one decision.
 
     Args:
-      params: of the stream.
-      inputs: [I], all inputs side by side.
-      hidden: [H].
-      changes: of the kernels `fuse`, `drive`, `core` and `actor`.
-      output_changes: added to their outputs.
+      params: parameters of the stream.
+      inputs: all inputs side by side, [I].
+      hidden: recurrent state, [H].
+      changes: changes of the kernels of `fuse`, `input_gates`, `hidden_gates` and `actor`, by layer.
+      output_changes: changes of the outputs of these layers.
     """
 
-    def layer(name: str, kernel: np.ndarray, x: np.ndarray) -> np.ndarray:
+    def apply_layer(name: str, kernel: np.ndarray, x: np.ndarray) -> np.ndarray:
         return x @ (kernel + changes.get(name, 0.0)) + output_changes.get(name, 0.0)
 
     core = params["core"]
-    fused = relu(layer("fuse", kernel_with_bias(params["fuse"]), append_one(inputs)))
+    fused = relu(apply_layer("fuse", kernel_with_bias(params["fuse"]), append_one(inputs)))
 
-    # The gated recurrent unit: reset, update and new state, each from the inputs and from the last state.
-    input_gates = layer("input_gates", kernel_with_bias(core["dense_i"]), append_one(fused))
-    hidden_gates = layer("hidden_gates", core["dense_h"]["kernel"], hidden)
+    # The gated recurrent unit: reset gate, update gate and new state, each from the inputs and from the last state.
+    input_gates = apply_layer("input_gates", kernel_with_bias(core["dense_i"]), append_one(fused))
+    hidden_gates = apply_layer("hidden_gates", core["dense_h"]["kernel"], hidden)
     input_reset, input_update, input_new = np.split(input_gates, 3, axis=-1)
     hidden_reset, hidden_update, hidden_new = np.split(hidden_gates, 3, axis=-1)
     reset = sigmoid(input_reset + hidden_reset)
@@ -175,11 +175,12 @@ def run_stream(
     new_state = np.tanh(input_new + reset * hidden_new)
     next_hidden = (1 - update) * new_state + update * hidden
 
-    return layer("actor", kernel_with_bias(params["actor"]), append_one(next_hidden)), next_hidden
+    logits = apply_layer("actor", kernel_with_bias(params["actor"]), append_one(next_hidden))
+    return logits, next_hidden
 
 
 class TwinPolicy:
-    """One policy, `fused` or in `streams`."""
+    """One policy, whose decision is `fused` or in `streams`."""
 
     def __init__(self, spec: PolicySpec, params: Params, method: TwinMethod):
         self.spec = spec
@@ -196,20 +197,20 @@ class TwinPolicy:
     def decide(
         self, features: TwinFeatures, surroundings: np.ndarray, weights: np.ndarray, memory: TwinMemory
     ) -> TwinDecision:
-        """Return both decisions.
+        """Return the factual and the counterfactual decision.
 
         Args:
-          features: of the view.
+          features: features of the view.
           surroundings: inputs from the map; empty without a map.
-          weights: [K], the layout's.
-          memory: before the decision.
+          weights: layout weights, [K].
+          memory: memory before the decision.
         """
         params = self.params
         weights = self._scale_weights(weights, int(features.goal.argmax()))
         features = self.method.perceive(features)
         reading = self.method.read(int(features.goal.argmax()))
 
-        # The three pathways.
+        # The three pathways: scene, goal and experience.
         scene_inputs = [features.view, surroundings, self.method.scene_inputs(reading)]
         scene = relu(linear(params["view"], np.concatenate(scene_inputs)))
         goal = self._embed_goal(features)
@@ -223,16 +224,17 @@ class TwinPolicy:
         return decide(scene, goal, experience, memory, reading)
 
     def _scale_weights(self, weights: np.ndarray, goal: int) -> np.ndarray:
-        """Return the goal's column of w at the scale of the spec; `relative` is over the mean off the goal."""
+        """Return the goal's column of w at the scale of the spec; `relative` divides by the mean off the goal."""
         if self.spec.weight_kind != "relative":
             return weights
-        others = [weight for category, weight in enumerate(weights.tolist()) if category != goal]
-        scaled = np.array([min(weight / (sum(others) / len(others)), 4.0) for weight in weights.tolist()])
-        scaled[goal] = weights[goal]
-        return scaled
+        other_weights = [weight for category, weight in enumerate(weights.tolist()) if category != goal]
+        mean_weight = sum(other_weights) / len(other_weights)
+        scaled_weights = np.array([min(weight / mean_weight, 4.0) for weight in weights.tolist()])
+        scaled_weights[goal] = weights[goal]
+        return scaled_weights
 
     def _scale_geometry(self, features: TwinFeatures) -> TwinFeatures:
-        """Return the features that experience reads; `pixel` multiplies all columns of geometry by 300."""
+        """Return the features that experience reads; `pixel` multiplies all columns with geometry by 300."""
         if self.spec.weight_kind != "pixel":
             return features
         table = features.table.copy()
@@ -268,7 +270,7 @@ class TwinPolicy:
         stream_params = self.params["experience_stream"]
         indirect, experience_hidden = run_stream(stream_params, experience_inputs, memory.hidden[1], {}, {})
 
-        # Logits are rounded, so that their sum can be undone.
+        # Logits are rounded, so that subtracting a stream undoes their sum exactly.
         direct = np.round(1024 * direct) / 1024
         indirect = np.round(1024 * indirect) / 1024
         logits = direct + indirect
@@ -279,9 +281,9 @@ class TwinPolicy:
     def _embed_goal(self, features: TwinFeatures) -> np.ndarray:
         """Return the embedding of detections and goal."""
         # Categories whose detections enter the direct pathway.
-        is_direct = {"all": np.ones_like(features.goal), "goal": features.goal, "none": 0 * features.goal}[
-            self.spec.direct
-        ]
+        masks = {"all": np.ones_like(features.goal), "goal": features.goal, "none": 0 * features.goal}
+        is_direct = masks[self.spec.direct]
+
         appearance = self.params["appearance"]["embedding"]
         rows = np.hstack([features.visible[:, None] * appearance, features.table])
         parts = [category_maps(self.params["detections"], is_direct[:, None] * rows)]

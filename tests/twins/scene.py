@@ -1,7 +1,7 @@
 """A scene in plain Python, from docs/environment.md alone.
 
-It shares no arithmetic with the compiled tables: lines of sight are tested object by object with the separating axis
-theorem, and walks are those of Dijkstra's algorithm.
+The twin shares no arithmetic with the compiled tables: lines of sight are tested object by object with the separating
+axis theorem, and walks come from Dijkstra's algorithm.
 """
 
 import functools
@@ -25,14 +25,14 @@ VIEW = 11
 
 
 def largest_component(reach: set[Cell]) -> set[Cell]:
-    """Return the largest connected part of cells, the first in row order among equal ones."""
+    """Return the largest connected part of cells, and the first in row order among parts of equal size."""
     largest: set[Cell] = set()
     unvisited = set(reach)
     for seed in sorted(reach):  # row order
         if seed not in unvisited:
             continue
 
-        # Everything that is connected with the seed.
+        # Collect the cells that are connected with the seed.
         unvisited.remove(seed)
         component = {seed}
         queue = [seed]
@@ -58,10 +58,11 @@ def degrees(rules: Rules, heading: int) -> float:
 def neighbour(rules: Rules, heading: int) -> Cell:
     """Return (dz, dx) of the neighbour in a heading's direction."""
 
-    def turn(step: Cell) -> float:
-        return abs((math.degrees(math.atan2(step[1], step[0])) - degrees(rules, heading) + 180) % 360 - 180)
+    def angle_to_heading(step: Cell) -> float:
+        step_angle = math.degrees(math.atan2(step[1], step[0]))
+        return abs((step_angle - degrees(rules, heading) + 180) % 360 - 180)
 
-    return min(NEIGHBOURS, key=turn)
+    return min(NEIGHBOURS, key=angle_to_heading)
 
 
 @functools.cache
@@ -76,14 +77,16 @@ def view_lines(rules: Rules, heading: int) -> list[tuple[Cell, set[Cell]] | None
                 view.append(None)
                 continue
 
-            # Rounded twice, for 2.4999999999999996 is a half, too.
+            # Round twice, because 2.4999999999999996 counts as a half.
             dz = round(round(ahead * math.cos(yaw) - right * math.sin(yaw), 9))
             dx = round(round(ahead * math.sin(yaw) + right * math.cos(yaw), 9))
             # The cell in front is the one to which MoveAhead leads.
             if (ahead, right) == (1, 0) and rules.front_cell == "move":
                 dz, dx = neighbour(rules, heading)
-            on_line = {(round(Fraction(dz * k, 22)), round(Fraction(dx * k, 22))) for k in range(1, 22)}
-            view.append(((dz, dx), on_line - {(0, 0), (dz, dx)}))
+
+            # Sample the line to the cell at 21 inner points, without the cells at its ends.
+            line_offsets = {(round(Fraction(dz * k, 22)), round(Fraction(dx * k, 22))) for k in range(1, 22)}
+            view.append(((dz, dx), line_offsets - {(0, 0), (dz, dx)}))
     return view
 
 
@@ -96,20 +99,23 @@ class TwinScene:
         self.lattice = {(iz, ix) for iz in range(scene.reach.shape[0]) for ix in range(scene.reach.shape[1])}
         self.walls = {cell for cell in self.lattice if scene.walls[cell]}
         self.standable = largest_component({cell for cell in self.lattice if scene.reach[cell]})
+
+        # Objects, with the category of their type or of its alias.
         self.boxes = []
-        for name, values in zip(scene.types, scene.boxes, strict=True):
-            if name not in categories:
-                name = ALIASES.get(name, name)
+        for object_type, values in zip(scene.types, scene.boxes, strict=True):
+            name = object_type if object_type in categories else ALIASES.get(object_type, object_type)
             category = categories.index(name) if name in categories else None
             self.boxes.append(Box(values, category))
 
-        #: Cells that hide the floor behind them: walls, and those under boxes as high as the camera.
-        self.hiding = set(self.walls)
+        #: Cells that hide the floor behind them: walls, and cells under boxes as high as the camera.
+        self.hiding_cells = set(self.walls)
         tall_boxes = [box for box in self.boxes if box.opaque and box.top >= self.rules.camera - 1e-9]
         for cell in self.lattice:
             position = self.position(cell)
             if any(contains(position, box.centre[::2], box.half[::2], 1e-9) for box in tall_boxes):
-                self.hiding.add(cell)
+                self.hiding_cells.add(cell)
+
+        # Results by cell and by category, computed at their first use.
         self._detectable: dict[Cell, list[tuple[Box, float]]] = {}
         self._walks: dict[int, dict[Cell, float]] = {}
 
@@ -122,7 +128,7 @@ class TwinScene:
     def detectable(self, cell: Cell) -> list[tuple[Box, float]]:
         """Return the objects that can be detected from a cell, with their distances.
 
-        They have a category and a clear line of sight, and are within their range.
+        Such objects have a category, a clear line of sight and a distance within their range.
         """
         if cell in self._detectable:
             return self._detectable[cell]
@@ -130,37 +136,41 @@ class TwinScene:
         detectable = []
         for box in self.boxes:
             distance = self.distance(cell, box)
-            if box.category is not None and distance <= box.range + 1e-9 and self._clear(cell, box):
+            if box.category is not None and distance <= box.range + 1e-9 and self._is_clear(cell, box):
                 detectable.append((box, distance))
         self._detectable[cell] = detectable
         return detectable
 
-    def _clear(self, cell: Cell, target: Box) -> bool:
-        """Check that the camera over a cell sees a box."""
+    def _is_clear(self, cell: Cell, target: Box) -> bool:
+        """Check that the camera over a cell has a clear line of sight to a box."""
         x, z = self.position(cell)
         camera = (x, self.rules.camera, z)
-        goal = target.centre
+        target_centre = target.centre
 
         # The line of sight ends 0.3 m before the target.
-        length = math.dist(camera, goal)
+        length = math.dist(camera, target_centre)
         if length < 0.3:
             return True
         share = (length - 0.3) / length
-        end = tuple(c + share * (g - c) for c, g in zip(camera, goal, strict=True))
+        end = tuple(c + share * (t - c) for c, t in zip(camera, target_centre, strict=True))
+
+        # Opaque boxes block, except the target itself and boxes around the target's centre or the camera.
         for box in self.boxes:
-            exempt = (
+            is_exempt = (
                 box is target
-                or contains(goal, box.centre, box.half)
+                or contains(target_centre, box.centre, box.half)
                 or contains((x, z), box.centre[::2], box.half[::2])
             )
-            if box.opaque and not exempt and meets(camera, end, box.centre, [h - SHRINK for h in box.half]):
+            if box.opaque and not is_exempt and meets(camera, end, box.centre, [h - SHRINK for h in box.half]):
                 return False
-        return not self._walled((x, z), end[::2], goal[::2])  # a wall cell blocks at every height
 
-    def _walled(self, start: Sequence[float], end: Sequence[float], target: Sequence[float]) -> bool:
+        # Wall cells block at every height.
+        return not self._meets_wall((x, z), end[::2], target_centre[::2])
+
+    def _meets_wall(self, start: Sequence[float], end: Sequence[float], target: Sequence[float]) -> bool:
         """Check whether a segment in the plane meets walls.
 
-        Those that contain its start or the target do not count.
+        Wall cells that contain the start of the segment or the target do not count.
         """
         # Only the cells around the segment can meet it.
         ranges = []
@@ -174,31 +184,33 @@ class TwinScene:
             if wall not in self.walls:
                 continue
             centre = self.position(wall)
-            exempt = any(contains(point, centre, (0.125, 0.125)) for point in (start, target))
-            if not exempt and meets(start, end, centre, (0.125 - SHRINK, 0.125 - SHRINK)):
+            is_exempt = any(contains(point, centre, (0.125, 0.125)) for point in (start, target))
+            if not is_exempt and meets(start, end, centre, (0.125 - SHRINK, 0.125 - SHRINK)):
                 return True
         return False
 
     def offsets(self, cell: Cell, heading: int, horizon: int, box: Box) -> tuple[float, float, bool]:
         """Return metres ahead and right of a box, and whether the camera's frustum holds its centre."""
-        # From the camera to the box, in the world's axes.
+        # Offset from the camera to the box, in the world's axes.
         x, z = self.position(cell)
-        vx = box.centre[0] - x
+        offset_x = box.centre[0] - x
         up = box.centre[1] - self.rules.camera
-        vz = box.centre[2] - z
+        offset_z = box.centre[2] - z
 
-        # Turned by the heading, then tilted by the horizon.
+        # Turn the offset by the heading, then tilt it by the horizon.
         yaw = math.radians(degrees(self.rules, heading))
-        fx = math.sin(yaw)
-        fz = math.cos(yaw)
-        ahead = vx * fx + vz * fz
-        right = vx * fz - vz * fx
+        forward_x = math.sin(yaw)
+        forward_z = math.cos(yaw)
+        ahead = offset_x * forward_x + offset_z * forward_z
+        right = offset_x * forward_z - offset_z * forward_x
         pitch = math.radians(self.rules.horizons[horizon])
         depth = ahead * math.cos(pitch) - up * math.sin(pitch)
         rise = ahead * math.sin(pitch) + up * math.cos(pitch)
 
+        # The frustum at this depth.
         half_width, half_height = (math.tan(math.radians(angle / 2)) * depth for angle in self.rules.field_of_view)
-        return ahead, right, depth > 0 and abs(right) <= half_width and abs(rise) <= half_height
+        is_in_view = depth > 0 and abs(right) <= half_width and abs(rise) <= half_height
+        return ahead, right, is_in_view
 
     def walk(self, cell: Cell, category: int) -> float:
         """Return the metres to walk to a category's nearest object, infinite if there is no way."""
@@ -207,7 +219,7 @@ class TwinScene:
         return self._walks[category].get(cell, math.inf)
 
     def _walks_to(self, category: int) -> dict[Cell, float]:
-        """Return the metres from every cell to a category, by Dijkstra's algorithm from the objects on."""
+        """Return the metres from every cell to a category, by Dijkstra's algorithm that starts at the objects."""
         queue = []
         for box in self.boxes:
             if box.category == category:
@@ -232,7 +244,7 @@ class TwinScene:
             start = self.position(cell)
             end = box.nearest(*start)
             length = math.dist(start, end)
-            if length <= 1 + 1e-9 and not self._walled(start, end, box.centre[::2]):
+            if length <= 1 + 1e-9 and not self._meets_wall(start, end, box.centre[::2]):
                 yield length, cell
 
     def view(self, cell: Cell, heading: int) -> list[int]:
@@ -243,8 +255,8 @@ class TwinScene:
             if line is None:
                 view.append(UNKNOWN)
                 continue
-            (dz, dx), on_line = line
-            if any((iz + line_dz, ix + line_dx) in self.hiding for line_dz, line_dx in on_line):
+            (dz, dx), line_offsets = line
+            if any((iz + line_dz, ix + line_dx) in self.hiding_cells for line_dz, line_dx in line_offsets):
                 view.append(UNKNOWN)
             elif (iz + dz, ix + dx) in self.standable:
                 view.append(STANDABLE)

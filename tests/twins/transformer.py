@@ -7,7 +7,7 @@ import numpy as np
 from twins.perception import TwinFeatures
 from twins.policy import Params, TwinMemory, TwinMethod, linear, relu, softmax
 
-#: Squares along a side of the view, and its cells.
+#: Squares and cells along a side of the view.
 SIDE = 5
 VIEW = 11
 
@@ -39,9 +39,9 @@ def residual_attention(
     return layer_norm(params["norm"], values + linear(params["out"], np.hstack(answers)))
 
 
-def square_cells(number: int) -> list[int]:
-    """Return the cells of a square, 3 x 3 every two cells, of both planes of the view."""
-    row, column = divmod(number, SIDE)
+def square_cells(square: int) -> list[int]:
+    """Return the cells of a square in both planes of the view; squares of 3 x 3 cells begin every two cells."""
+    row, column = divmod(square, SIDE)
     cells = []
     for i in range(3):
         for j in range(3):
@@ -49,10 +49,10 @@ def square_cells(number: int) -> list[int]:
     return cells + [VIEW**2 + cell for cell in cells]
 
 
-def position_code(number: int, width: int) -> np.ndarray:
-    """Return the code of a square's place: sines and cosines of its row, then of its column."""
+def position_code(square: int, width: int) -> np.ndarray:
+    """Return the code of a square's position: sines and cosines of its row, then of its column."""
     code = []
-    for coordinate in divmod(number, SIDE):
+    for coordinate in divmod(square, SIDE):
         angles = [coordinate * math.pi / SIDE / 2**i for i in range(width // 4)]
         code.extend(math.sin(angle) for angle in angles)
         code.extend(math.cos(angle) for angle in angles)
@@ -75,26 +75,27 @@ class TwinTransformer(TwinMethod):
     ) -> np.ndarray:
         # A token for the goal and for each detection, encoded and weighted by the layout.
         goal = int(features.goal.argmax())
-        visible = np.flatnonzero(features.visible).tolist()
-        categories = [goal, *(category for category in visible if category != goal)][: self.num_tokens]
+        visible_categories = np.flatnonzero(features.visible).tolist()
+        other_categories = [category for category in visible_categories if category != goal]
+        categories = [goal, *other_categories][: self.num_tokens]
         tokens = linear(params["token"], np.hstack([appearance[categories], features.table[categories]]))
         for layer in self._layers(params["encoder"]):
-            attended = residual_attention(layer["tokens"], tokens, tokens, tokens, tokens)
-            tokens = residual_perceptron(layer["forward"], attended)
+            mixed_tokens = residual_attention(layer["tokens"], tokens, tokens, tokens, tokens)
+            tokens = residual_perceptron(layer["forward"], mixed_tokens)
         experience = weights[categories][:, None] * tokens
 
-        # A query for each square, with the code of its place.
-        squares = np.array([features.view[square_cells(i)] for i in range(SIDE**2)])
-        query = relu(linear(params["query"], squares))
-        query += np.array([position_code(i, query.shape[1]) for i in range(SIDE**2)])
+        # A query for each square, with the code of its position.
+        square_views = np.array([features.view[square_cells(square)] for square in range(SIDE**2)])
+        query = relu(linear(params["query"], square_views))
+        query += np.array([position_code(square, query.shape[1]) for square in range(SIDE**2)])
 
         # The squares attend to each other (but for the first layer), then to the tokens.
         answer = np.zeros_like(query)
         for layer in self._layers(params["decoder"]):
             if "answers" in layer:
                 answer = residual_attention(layer["answers"], answer, answer + query, answer + query, answer)
-            attended = residual_attention(layer["tokens"], answer, answer + query, experience, experience)
-            answer = residual_perceptron(layer["forward"], attended)
+            token_answer = residual_attention(layer["tokens"], answer, answer + query, experience, experience)
+            answer = residual_perceptron(layer["forward"], token_answer)
         return relu(linear(params["maps"], answer)).ravel()
 
     @staticmethod
