@@ -1,4 +1,4 @@
-"""The committed pages are those of the committed results, and these those of the packaged experiments."""
+"""Committed pages are written from the committed results, which are those of the packaged experiments."""
 
 import dataclasses
 import json
@@ -21,7 +21,7 @@ from jaxnav.policies.methods.local_policy import LocalPolicy
 from jaxnav.runs.config_files import apply_yaml
 
 ROOT = Path(__file__).parents[2]
-#: Experiments with results of their own; all others measure a run that is given.
+#: Experiments whose results are committed; the remaining experiments measure a run that the user gives.
 COMMITTED: dict[str, ExperimentConfig] = {}
 for _name in EXPERIMENTS:
     _config = apply_yaml(ExperimentConfig(), _name, EXPERIMENTS)
@@ -30,8 +30,8 @@ for _name in EXPERIMENTS:
 
 
 @pytest.fixture(autouse=True)
-def without_figures(monkeypatch):
-    """Work at the root of the checkout, to which the paths of experiments are relative, and draw no figures."""
+def skip_figures(monkeypatch):
+    """Pages are written without drawing figures, from the root of the checkout, to which paths are relative."""
     monkeypatch.chdir(ROOT)
 
     def name_figure(document, name, table, shifts, fields):
@@ -45,7 +45,7 @@ def list_all_parts(config: ExperimentConfig) -> list[Part]:
 
 
 def copy_documents(config: ExperimentConfig, folder: Path) -> ExperimentConfig:
-    """The experiment, with copies of its documents in a folder."""
+    """Experiment with copies of its documents in a folder."""
     copies = {}
     for document, template in config.pages.items():
         copies[str(shutil.copy(document, folder))] = template
@@ -62,7 +62,7 @@ def test_committed_documents_are_written_from_the_committed_results(name, tmp_pa
         content = Path(document).read_bytes()
         assert Path(copied_document).read_bytes() == content
 
-        # Every figure that the document names is committed, too.
+        # The figures of the document are committed, too.
         for image in re.findall(r"!\[[^\]]*\]\((images/[^)]+)\)", content.decode()):
             assert (Path(document).parent / image).is_file()
 
@@ -80,33 +80,36 @@ def test_every_committed_file_of_results_belongs_to_an_experiment():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", COMMITTED)
-def test_committed_results_are_written_as_they_were_read(name, tmp_path):
+def test_committed_results_are_rewritten_without_a_change(name, tmp_path):
+    new_path = tmp_path / "part.jsonl"
     for path in sorted(COMMITTED[name].results.rglob("*.jsonl")):
-        head, *lines = path.read_text().splitlines()
-        write_part(tmp_path / "part.jsonl", json.loads(head)["settings"], read_part(path))
-        new_head, *new_lines = (tmp_path / "part.jsonl").read_text().splitlines()
-        assert new_lines == lines
-        assert json.loads(new_head)["shared"] == json.loads(head)["shared"]
+        head_line, *row_lines = path.read_text().splitlines()
+        head = json.loads(head_line)
+        write_part(new_path, head["settings"], read_part(path))
+        new_head_line, *new_row_lines = new_path.read_text().splitlines()
+        assert new_row_lines == row_lines
+        assert json.loads(new_head_line)["shared"] == head["shared"]
 
 
-#: Experiments whose pages have between them all templates of tables.
-SEVERAL_TEMPLATES = ["claims", "streams", "table2", "table3", "study_rooms", "accounts", "removal_houses"]
+#: Experiments whose pages together use all templates of tables.
+SLOW_EXPERIMENTS = ["claims", "streams", "table2", "table3", "study_rooms", "accounts", "removal_houses"]
 
 
-@pytest.mark.parametrize("name", params_by_tier(COMMITTED, slow=SEVERAL_TEMPLATES))
-def test_pages_can_be_written_from_the_first_result_on(name, tmp_path):
+@pytest.mark.parametrize("name", params_by_tier(COMMITTED, slow=SLOW_EXPERIMENTS))
+def test_pages_can_be_written_with_partial_results(name, tmp_path):
     """Pages are written after every part, so that an interrupted experiment has them."""
     config = dataclasses.replace(copy_documents(COMMITTED[name], tmp_path), results=tmp_path / "results")
     parts = list_all_parts(config)
     (config.results / "val").mkdir(parents=True)
+    page_indices = (0, len(parts) // 3, 2 * len(parts) // 3, len(parts) - 1)
 
-    # Parts arrive one after the other; a few of them, with the first and the last, stand for all.
-    # Results of an unfinished experiment are still missing, which its page tells.
+    # Copy one part after another, and write the pages after the first, the last and some parts between them. An
+    # unfinished experiment lacks results, which its page says.
     for index, part in enumerate(parts):
         path = COMMITTED[name].results / "val" / f"{part.name}.jsonl"
         if path.exists():
             shutil.copy(path, config.results / "val")
-        if index in (0, len(parts) // 3, 2 * len(parts) // 3, len(parts) - 1):
+        if index in page_indices:
             for text in write_pages(config, parts):
                 assert text.count(READING_MARK) == 2
                 assert "nan" not in re.findall(r"\w+", text)
@@ -117,12 +120,12 @@ def test_pages_can_be_written_from_the_first_result_on(name, tmp_path):
 
 @pytest.mark.parametrize("name", ["table2", "real"])
 def test_table_2_has_the_methods_of_the_paper(name):
-    # Beside them are layout-blind agents, EOTP adapted to ever changing scenes, and further seeds of ORG.
+    # Further agents are layout-blind agents, EOTP adapted to ever changing scenes, and more seeds of ORG.
     methods = set(COMMITTED[name].agents) - {"anonymous", "eotp:ADAPTED", "org-again"}
     hosts = {method for method in methods if not method.endswith("-streams")}
     assert hosts == {"rgb", "sp", "savn", "eotp", "org", "tpn", "vtnet", "hoz"}
 
-    # Whatever hosts the layout is trained without and with it, and with two streams.
+    # Hosts of the layout are trained without it, with it, and with two streams.
     for run in agent_runs(COMMITTED[name]):
         hosts_layout = find_method(run.config.method).hosts_layout
         if run.agent.endswith("-streams"):
@@ -134,10 +137,11 @@ def test_table_2_has_the_methods_of_the_paper(name):
 
 
 @pytest.mark.parametrize("name", ["table2", "table3", "ablations", "real", "real_homes"])
-def test_all_methods_of_a_world_learn_from_as_many_steps(name):
+def test_all_methods_of_a_world_learn_from_equally_many_steps(name):
     runs_by_world: dict[str, list] = {}
     for run in agent_runs(COMMITTED[name]):
-        if run.agent not in ("semexp:NEAREST", "belief"):  # one learns nothing, the other fits predictors
+        # `semexp:NEAREST` learns nothing, and `belief` fits predictors.
+        if run.agent not in ("semexp:NEAREST", "belief"):
             runs_by_world.setdefault(run.world, []).append(run)
     for runs in runs_by_world.values():
         assert len({max_trained_steps([run]) for run in runs}) == 1
@@ -145,6 +149,6 @@ def test_all_methods_of_a_world_learn_from_as_many_steps(name):
 
 
 @pytest.mark.parametrize("name", ["table3", "real_homes"])
-def test_rollouts_hold_two_choices_of_methods_that_choose_goals(name):
+def test_rollouts_have_two_choices_of_methods_that_choose_goals(name):
     for run in agent_runs(COMMITTED[name]):
         assert run.config.ppo.rollout >= 2 * LocalPolicy.interval

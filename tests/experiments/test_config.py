@@ -1,4 +1,4 @@
-"""Configurations of experiments: their runs, and the settings that are refused."""
+"""Configurations of experiments: their runs, refused settings, and the packaged experiments."""
 
 import dataclasses
 from pathlib import Path
@@ -27,7 +27,7 @@ from jaxnav.runs.run import run_settings
 
 REPOSITORY = Path(__file__).parents[2]
 #: Experiments that measure finished runs.
-OF_FINISHED_RUNS = ("account", "cde", "mixture", "handover", "instrument")
+FINISHED_RUN_EXPERIMENTS = ("account", "cde", "mixture", "handover", "instrument")
 WORLDS = {"near": {"world": "rooms"}, "far": {"world": "apartments", "seeds": 4}}
 AGENTS = {"plain": {}, "wide": {"sizes": {"hidden": 256}, "seeds": 5}}
 
@@ -37,11 +37,11 @@ def make_config(**changes: Any) -> ExperimentConfig:
     return dataclasses.replace(config, **changes)
 
 
-def names_of(runs: list[AgentRun]) -> list[str]:
+def list_names(runs: list[AgentRun]) -> list[str]:
     return [run.name for run in runs]
 
 
-def run_of(config: ExperimentConfig, name: str) -> AgentRun:
+def find_run(config: ExperimentConfig, name: str) -> AgentRun:
     (run,) = [run for run in agent_runs(config) if run.name == name]
     return run
 
@@ -49,22 +49,23 @@ def run_of(config: ExperimentConfig, name: str) -> AgentRun:
 # Runs of an experiment
 
 
-def test_agents_change_the_worlds_which_change_the_base():
+def test_agents_override_settings_of_worlds_which_override_the_base():
     config = make_config()
     seeds = {run.name: run.config.seeds for run in agent_runs(config)}
     # The base has two seeds, the world `far` four, and the agent `wide` five.
     assert seeds == {"near-plain": 2, "near-wide": 5, "far-plain": 4, "far-wide": 5}
 
-    # Nested settings that nobody names stay.
-    far_wide = run_of(config, "far-wide").config
+    # All settings that neither a world nor an agent changes are those of the base.
+    far_wide = find_run(config, "far-wide").config
     assert (far_wide.world, far_wide.total_steps, far_wide.sizes.hidden) == ("apartments", 1000, 256)
     assert far_wide.sizes == dataclasses.replace(RunConfig().sizes, hidden=256)
 
 
-def test_runs_have_folders_of_their_own():
+def test_each_run_has_its_own_folder():
     config = make_config(runs=Path("somewhere"), agents={"hoz:PERMUTED": {"method": "hoz"}})
     run_dirs = [run.config.run_dir for run in agent_runs(config)]
-    # A colon is no part of file names everywhere.
+
+    # A hyphen replaces the colon, which some file systems refuse.
     assert run_dirs == [Path("somewhere/near-hoz-PERMUTED"), Path("somewhere/far-hoz-PERMUTED")]
 
 
@@ -79,40 +80,41 @@ def test_runs_have_folders_of_their_own():
 )
 def test_patterns_select_the_measured_runs(patterns, names):
     config = check_experiment(make_config(**patterns))
-    assert names_of(measured_runs(config, "evaluation")) == names
+    assert list_names(measured_runs(config, "evaluation")) == names
 
 
-def test_runs_that_are_not_measured_now_exist_but_for_those_that_are_left_out():
+def test_left_out_runs_do_not_exist_and_unselected_runs_do():
     config = make_config(only=("near-*",), left_out=("*-wide",))
-    assert names_of(agent_runs(config)) == ["near-plain", "far-plain"]
+    assert list_names(agent_runs(config)) == ["near-plain", "far-plain"]
 
 
 def test_measured_runs_match_by_agent_or_by_world_and_agent():
     config = make_config(measure={"evaluation": ["wide", "far-plain"], "trials": []})
-    assert names_of(measured_runs(config, "evaluation")) == ["near-wide", "far-plain", "far-wide"]
+    assert list_names(measured_runs(config, "evaluation")) == ["near-wide", "far-plain", "far-wide"]
     assert measured_runs(config, "trials") == []
 
 
-def test_scenes_that_are_missing_do_not_hinder_whoever_only_reads_results():
+def test_missing_scenes_are_no_error_for_readers_of_results():
     config = check_experiment(make_config(worlds={"near": {"scenes": "missing.jsonl.gz"}}))
-    assert run_of(config, "near-plain").config.scenes == Path("missing.jsonl.gz")
+    assert find_run(config, "near-plain").config.scenes == Path("missing.jsonl.gz")
 
 
-def test_part_settings_tell_the_runs_and_evaluations_apart_that_differ():
+def test_part_settings_differ_for_other_runs_and_evaluations():
     config = make_config()
-    plain, wide = (run_of(config, name) for name in ("near-plain", "near-wide"))
-    settings = part_settings(config, plain, [wide])
-    assert settings == part_settings(make_config(runs=Path("elsewhere"), title="Another"), plain, [wide])
+    plain_run = find_run(config, "near-plain")
+    wide_run = find_run(config, "near-wide")
+    settings = part_settings(config, plain_run, [wide_run])
+
+    # The folder of the runs and the title are no part of the settings.
+    renamed_config = make_config(runs=Path("elsewhere"), title="Another")
+    assert settings == part_settings(renamed_config, plain_run, [wide_run])
 
     # Another run, another setting of the evaluation, another reference, and no reference.
-    longer = wide._replace(config=dataclasses.replace(wide.config, total_steps=2000))
-    others = [
-        part_settings(config, wide, [wide]),
-        part_settings(make_config(episodes=7), plain, [wide]),
-        part_settings(config, plain, [longer]),
-        part_settings(config, plain, []),
-    ]
-    assert all(other != settings for other in others)
+    longer_run = wide_run._replace(config=dataclasses.replace(wide_run.config, total_steps=2000))
+    assert settings != part_settings(config, wide_run, [wide_run])
+    assert settings != part_settings(make_config(episodes=7), plain_run, [wide_run])
+    assert settings != part_settings(config, plain_run, [longer_run])
+    assert settings != part_settings(config, plain_run, [])
 
 
 # Finished runs in place of agents
@@ -123,9 +125,10 @@ def test_finished_runs_replace_the_agents(drawn_run):
     config = check_experiment(
         ExperimentConfig(run=run_dir, reference=str(run_dir), agents={}, pages={"docs/account.md": "account"})
     )
-    # The world is that of the run, and everything that is written goes to its folder.
+
+    # The run determines the world, and all files are written to its folder.
     runs = agent_runs(config)
-    assert names_of(runs) == ["rooms-main", "rooms-anonymous"]
+    assert list_names(runs) == ["rooms-main", "rooms-anonymous"]
     for run in runs:
         assert run.is_external
         assert run.config.run_dir == run_dir
@@ -147,7 +150,7 @@ def test_finished_runs_of_agents_keep_their_settings_and_references(drawn_run):
 
 
 @pytest.mark.parametrize(
-    ("changes", "named"),
+    ("changes", "message"),
     [
         # The evaluation.
         ({"shifts": ()}, "shifts"),
@@ -215,13 +218,13 @@ def test_finished_runs_of_agents_keep_their_settings_and_references(drawn_run):
         ({"run": Path("nowhere"), "agents": {"plain": {}}}, "nowhere"),
     ],
 )
-def test_invalid_settings_are_refused_by_name(changes, named):
-    with pytest.raises(InputError, match=named) as refusal:
+def test_invalid_settings_are_refused_by_name(changes, message):
+    with pytest.raises(InputError, match=message) as refusal:
         check_experiment(make_config(**changes))
     assert "\n" not in str(refusal.value)
 
 
-def test_finished_runs_take_no_place_of_other_agents(drawn_run):
+def test_a_finished_run_is_refused_next_to_other_agents(drawn_run):
     with pytest.raises(InputError, match=r"run: .*already has agents"):
         check_experiment(make_config(run=drawn_run.config.run_dir))
 
@@ -233,17 +236,17 @@ def test_finished_runs_refuse_settings(drawn_run):
 
 
 @pytest.mark.parametrize(
-    ("changes", "named"),
+    ("changes", "message"),
     [
         ({"measure": {"trails": ["*"]}}, "measure: 'trails'"),
-        # One shift has nothing to be compared with.
+        # These measurements compare shifts.
         ({"measure": {"growth": ["*"]}, "shifts": (0.5,)}, "shifts"),
         ({"measure": {"mixture": ["*"]}, "shifts": (0.5,)}, "shifts"),
         ({"removals": ("surprise, papper*",)}, "removals: 'surprise, papper"),
     ],
 )
-def test_impossible_measurements_are_refused_by_name(changes, named):
-    with pytest.raises(InputError, match=named):
+def test_impossible_measurements_are_refused_by_name(changes, message):
+    with pytest.raises(InputError, match=message):
         check_measurements(make_config(**changes))
 
 
@@ -254,26 +257,27 @@ def test_impossible_measurements_are_refused_by_name(changes, named):
 def test_packaged_experiments_are_valid(name, drawn_run, monkeypatch):
     monkeypatch.chdir(REPOSITORY)
     config = apply_yaml(ExperimentConfig(), name, EXPERIMENTS)
-    if name in OF_FINISHED_RUNS:
+    if name in FINISHED_RUN_EXPERIMENTS:
         config = dataclasses.replace(config, run=drawn_run.config.run_dir, reference=str(drawn_run.config.run_dir))
     config = check_measurements(config)
 
-    # Every page can be written, and no result has the file of another.
+    # Every page can be written, and every part has its own file.
     for document, template in config.pages.items():
         check_page(Path(document), template)
     parts = list_parts(config, Bench(config, Console(quiet=True)))
     assert len({part.name for part in parts}) == len(parts) > 0
 
 
-@pytest.mark.parametrize("name", sorted(set(EXPERIMENTS) - set(OF_FINISHED_RUNS)))
+@pytest.mark.parametrize("name", sorted(set(EXPERIMENTS) - set(FINISHED_RUN_EXPERIMENTS)))
 def test_committed_results_are_recognized(name, monkeypatch):
     monkeypatch.chdir(REPOSITORY)
-    packaged = apply_yaml(ExperimentConfig(), name, EXPERIMENTS)
+    packaged_config = apply_yaml(ExperimentConfig(), name, EXPERIMENTS)
 
-    # Those of `val` are complete unless a page tells otherwise; of `test` some were measured.
-    is_unfinished = any("**Not finished:**" in Path(page).read_text() for page in packaged.pages)
+    # Results on `val` are complete unless a page says that they are not finished; those on `test` may be missing.
+    is_unfinished = any("**Not finished:**" in Path(page).read_text() for page in packaged_config.pages)
     for split in ("val", "test"):
-        config = check_experiment(dataclasses.replace(packaged, split=split))
+        may_be_missing = is_unfinished or split == "test"
+        config = check_experiment(dataclasses.replace(packaged_config, split=split))
         for part in list_parts(config, Bench(config, Console(quiet=True))):
             path = config.results / split / f"{part.name}.jsonl"
-            assert has_part(path, part.settings) or ((is_unfinished or split == "test") and not path.exists()), path
+            assert has_part(path, part.settings) or (may_be_missing and not path.exists()), path

@@ -1,4 +1,4 @@
-"""The driver of experiments: what it measures, what it reuses, and what it leaves when it is stopped."""
+"""The driver of experiments: measured parts, reused results, refusals, and files of interrupted experiments."""
 
 import dataclasses
 import json
@@ -27,7 +27,7 @@ from jaxnav.runs.config_files import apply_yaml
 from jaxnav.runs.run import Run
 
 QUIET = Console(quiet=True)
-#: A page with all results, and the number of those that are missing.
+#: A page with all results and the number of missing ones.
 TEMPLATE = """# {{ config.title }}
 
 {{ summary }}
@@ -43,26 +43,26 @@ Missing: {{ missing | length }}.
 
 
 @pytest.fixture
-def measured(monkeypatch) -> list[tuple[str, Any]]:
-    """Replace all measurements by two that only say of what they were taken; returns what they said."""
+def measure_calls(monkeypatch) -> list[tuple[str, Any]]:
+    """Calls of two measurements that stand in for all measurements: agent, and shift or `summary`."""
     calls: list[tuple[str, Any]] = []
 
     def measure_shift(bench: Bench, run: AgentRun, shift: float) -> Iterator[ResultRow]:
         calls.append((run.agent, shift))
         yield ResultRow(world=run.world, run=run.agent, shift=shift, metric="sr", value=Interval(50.0 + shift))
 
-    def measure_run(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
-        calls.append((run.agent, "whole"))
+    def measure_summary(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
+        calls.append((run.agent, "summary"))
         yield ResultRow(world=run.world, run=run.agent, metric="spl", value=Interval(25.0))
 
-    measurements = {"shifts": Measurement(measure_shift, parts="shifts"), "whole": Measurement(measure_run)}
+    measurements = {"shifts": Measurement(measure_shift, parts="shifts"), "summary": Measurement(measure_summary)}
     monkeypatch.setattr(driver, "MEASUREMENTS", measurements)
     return calls
 
 
-#: What the experiment of `make_config` measures, in order, and the files that it leaves.
-ALL_CALLS = [("a", 0.0), ("a", 0.5), ("b", 0.0), ("b", 0.5), ("b", "whole")]
-ALL_FILES = ["near-a-shifts-0", "near-a-shifts-0.5", "near-b-shifts-0", "near-b-shifts-0.5", "near-b-whole"]
+#: Calls and result files of the experiment of `make_config`, in order.
+ALL_CALLS = [("a", 0.0), ("a", 0.5), ("b", 0.0), ("b", 0.5), ("b", "summary")]
+ALL_FILES = ["near-a-shifts-0", "near-a-shifts-0.5", "near-b-shifts-0", "near-b-shifts-0.5", "near-b-summary"]
 
 
 def make_config(folder: Path, **changes: Any) -> ExperimentConfig:
@@ -77,21 +77,22 @@ def make_config(folder: Path, **changes: Any) -> ExperimentConfig:
         pages={str(folder / "docs" / "page.md"): str(template)},
         worlds={"near": {}},
         agents={"a": {}, "b": {"seeds": 4}},
-        measure={"shifts": ["*"], "whole": ["b"]},
+        measure={"shifts": ["*"], "summary": ["b"]},
         shifts=(0.0, 0.5),
     )
     return check_experiment(dataclasses.replace(config, **changes))
 
 
-def results_of(folder: Path) -> Path:
+def results_folder(folder: Path) -> Path:
+    """Folder of the results on `val`."""
     return folder / "results" / "val"
 
 
-def test_driver_measures_every_part_and_writes_the_page(measured, tmp_path):
+def test_driver_measures_every_part_and_writes_the_page(measure_calls, tmp_path):
     config = make_config(tmp_path)
     (text,) = run_experiment(config, QUIET)
-    assert measured == ALL_CALLS
-    assert sorted(path.stem for path in results_of(tmp_path).iterdir()) == ALL_FILES
+    assert measure_calls == ALL_CALLS
+    assert sorted(path.stem for path in results_folder(tmp_path).iterdir()) == ALL_FILES
     page = (tmp_path / "docs" / "page.md").read_text()
     assert page.strip() == text.strip()
     assert "# Two agents" in page
@@ -99,24 +100,27 @@ def test_driver_measures_every_part_and_writes_the_page(measured, tmp_path):
     assert "| b | 0.5 |  | 50.5 |" in page
 
 
-def test_page_tells_what_is_missing_of_agents_that_were_not_selected(measured, tmp_path):
+def test_page_counts_the_missing_results_of_agents_that_were_not_selected(measure_calls, tmp_path):
     (text,) = run_experiment(make_config(tmp_path, only=("near-a",)), QUIET)
-    assert measured == ALL_CALLS[:2]
-    assert "Missing: 3." in text  # both shifts of b, and its whole
+    assert measure_calls == ALL_CALLS[:2]
+    assert "Missing: 3." in text  # two shifts and the summary of b
 
 
-def test_driver_reuses_everything_the_second_time(measured, tmp_path):
+def test_driver_reuses_everything_the_second_time(measure_calls, tmp_path):
     config = make_config(tmp_path)
     run_experiment(config, QUIET)
+
+    # A person writes a text between the marks of the page.
     document = tmp_path / "docs" / "page.md"
     mark = "<!-- reading -->"
     document.write_text(document.read_text().replace(f"{mark}\n\n{mark}", f"{mark}\nBy hand.\n{mark}"))
-    before = contents(tmp_path)
-    measured.clear()
+    files_before = contents(tmp_path)
+    measure_calls.clear()
 
+    # The second run measures nothing and changes no file.
     run_experiment(config, QUIET)
-    assert measured == []
-    assert contents(tmp_path) == before
+    assert measure_calls == []
+    assert contents(tmp_path) == files_before
     assert "By hand." in document.read_text()
 
 
@@ -131,16 +135,19 @@ def test_driver_keeps_unfinished_outcomes_only_until_a_part_is_finished(tmp_path
             raise KeyboardInterrupt
         yield ResultRow(world=run.world, run=run.agent, metric="spl", value=Interval(25.0))
 
-    monkeypatch.setattr(driver, "MEASUREMENTS", {"whole": Measurement(measure)})
-    config = make_config(tmp_path, measure={"whole": ["b"]})
+    # The first call is interrupted; its outcomes are still needed.
+    monkeypatch.setattr(driver, "MEASUREMENTS", {"summary": Measurement(measure)})
+    config = make_config(tmp_path, measure={"summary": ["b"]})
     with pytest.raises(KeyboardInterrupt):
         run_experiment(config, QUIET)
     assert folders[0].is_dir()
+
+    # The second call finds the folder, which is removed after the part.
     run_experiment(config, QUIET)
     assert folders == [folders[0]] * 2
     assert not folders[0].exists()
 
-    # Other settings have other outcomes.
+    # Other settings have another folder.
     changed_config = dataclasses.replace(config, episodes=7, results=tmp_path / "others")
     run_experiment(changed_config, QUIET)
     assert folders[2].name != folders[0].name
@@ -151,19 +158,19 @@ def truncate(path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", [Path.unlink, truncate, lambda path: path.write_text("")])
-def test_driver_measures_parts_again_that_are_missing_or_damaged(measured, tmp_path, damage):
+def test_driver_measures_parts_again_that_are_missing_or_damaged(measure_calls, tmp_path, damage):
     config = make_config(tmp_path)
     run_experiment(config, QUIET)
-    before = contents(tmp_path)
-    measured.clear()
+    files_before = contents(tmp_path)
+    measure_calls.clear()
 
-    # The last part is damaged, and an earlier one is missing: the page after it is written without the damaged one.
-    results = results_of(tmp_path)
+    # The last shift is damaged, and an earlier part is missing: the page after the earlier part lacks the last shift.
+    results = results_folder(tmp_path)
     damage(results / "near-b-shifts-0.5.jsonl")
     (results / "near-a-shifts-0.jsonl").unlink()
     run_experiment(config, QUIET)
-    assert measured == [("a", 0.0), ("b", 0.5)]
-    assert contents(tmp_path) == before
+    assert measure_calls == [("a", 0.0), ("b", 0.5)]
+    assert contents(tmp_path) == files_before
 
 
 @pytest.mark.parametrize(
@@ -175,69 +182,75 @@ def test_driver_measures_parts_again_that_are_missing_or_damaged(measured, tmp_p
         ({"title": "Two others", "runs": Path("elsewhere")}, []),
     ],
 )
-def test_driver_measures_what_an_experiment_has_more(measured, tmp_path, changes, calls):
-    # Another shift does not concern what is measured at none.
-    measure = {"shifts": ["*"]} if "shifts" in changes else {"shifts": ["*"], "whole": ["b"]}
+def test_driver_measures_only_the_parts_that_an_experiment_adds(measure_calls, tmp_path, changes, calls):
+    # The summary has no shift, so that it is left out where the shifts change.
+    measure = {"shifts": ["*"]}
+    if "shifts" not in changes:
+        measure["summary"] = ["b"]
     run_experiment(make_config(tmp_path, measure=measure), QUIET)
-    measured.clear()
+    measure_calls.clear()
     run_experiment(make_config(tmp_path, measure=measure, **changes), QUIET)
-    assert measured == calls
+    assert measure_calls == calls
 
 
 @pytest.mark.parametrize("changes", [{"agents": {"a": {"seed": 1}, "b": {"seeds": 4}}}, {"episodes": 30}])
-def test_driver_refuses_to_lose_results_of_other_settings(measured, tmp_path, changes):
+def test_driver_refuses_to_lose_results_of_other_settings(measure_calls, tmp_path, changes):
     run_experiment(make_config(tmp_path), QUIET)
-    before = contents(tmp_path)
-    measured.clear()
+    files_before = contents(tmp_path)
+    measure_calls.clear()
 
     with pytest.raises(InputError, match=r"near-a-shifts-0\.jsonl.*(seed|episodes)"):
         run_experiment(make_config(tmp_path, **changes), QUIET)
-    assert measured == []
-    assert contents(tmp_path) == before
+    assert measure_calls == []
+    assert contents(tmp_path) == files_before
 
-    # In another folder there is nothing to lose.
+    # Another folder has no results to lose.
     run_experiment(make_config(tmp_path, results=tmp_path / "others", **changes), QUIET)
-    assert measured == ALL_CALLS
+    assert measure_calls == ALL_CALLS
 
 
-def test_driver_refuses_to_lose_results_of_another_format(measured, tmp_path):
+def test_driver_refuses_to_lose_results_of_another_format(measure_calls, tmp_path):
     run_experiment(make_config(tmp_path), QUIET)
-    path = results_of(tmp_path) / "near-a-shifts-0.jsonl"
-    head, *lines = path.read_text().splitlines(keepends=True)
-    path.write_text("".join([json.dumps(json.loads(head) | {"format": 2}) + "\n", *lines]))
-    before = contents(tmp_path)
-    measured.clear()
+
+    # The head of a file tells its format.
+    path = results_folder(tmp_path) / "near-a-shifts-0.jsonl"
+    head_line, *row_lines = path.read_text().splitlines(keepends=True)
+    other_head = json.loads(head_line) | {"format": 2}
+    path.write_text("".join([json.dumps(other_head) + "\n", *row_lines]))
+    files_before = contents(tmp_path)
+    measure_calls.clear()
 
     with pytest.raises(InputError, match=r"near-a-shifts-0\.jsonl: holds no results of format \d+; move it away"):
         run_experiment(make_config(tmp_path), QUIET)
-    assert measured == []
-    assert contents(tmp_path) == before
+    assert measure_calls == []
+    assert contents(tmp_path) == files_before
 
 
-def test_driver_goes_on_where_it_was_stopped(measured, tmp_path, monkeypatch):
-    run_experiment(make_config(tmp_path / "whole"), QUIET)
-    expected = contents(tmp_path / "whole")
+def test_driver_goes_on_where_it_was_stopped(measure_calls, tmp_path, monkeypatch):
+    run_experiment(make_config(tmp_path / "complete"), QUIET)
+    expected_files = contents(tmp_path / "complete")
 
     # Ctrl-C while the second part is measured.
     config = make_config(tmp_path / "stopped")
     with monkeypatch.context() as patches:
-        interrupted = Measurement(interrupt_second(driver.MEASUREMENTS["shifts"].measure), parts="shifts")
-        patches.setitem(driver.MEASUREMENTS, "shifts", interrupted)
+        interrupted_measure = interrupt_second(driver.MEASUREMENTS["shifts"].measure)
+        patches.setitem(driver.MEASUREMENTS, "shifts", Measurement(interrupted_measure, parts="shifts"))
         with pytest.raises(KeyboardInterrupt):
             run_experiment(config, QUIET)
-    assert [path.stem for path in results_of(tmp_path / "stopped").iterdir()] == ALL_FILES[:1]
+    assert [path.stem for path in results_folder(tmp_path / "stopped").iterdir()] == ALL_FILES[:1]
     page = (tmp_path / "stopped" / "docs" / "page.md").read_text()
     assert "Missing: 4." in page
     assert " | 50.0 |" in page
 
-    measured.clear()
+    # The next run measures the missing parts only.
+    measure_calls.clear()
     run_experiment(config, QUIET)
-    assert measured == ALL_CALLS[1:]
-    assert contents(tmp_path / "stopped") == expected
+    assert measure_calls == ALL_CALLS[1:]
+    assert contents(tmp_path / "stopped") == expected_files
 
 
 def interrupt_second(measure):
-    """Measure once, and be interrupted within the second part."""
+    """Make a measurement that is interrupted within its second part."""
     num_calls = 0
 
     def measure_or_interrupt(*arguments) -> Iterator[ResultRow]:
@@ -251,55 +264,56 @@ def interrupt_second(measure):
     return measure_or_interrupt
 
 
-def test_driver_refuses_a_foreign_document_before_it_measures(measured, tmp_path):
+def test_driver_refuses_a_foreign_document_before_it_measures(measure_calls, tmp_path):
     config = make_config(tmp_path)
     document = tmp_path / "docs" / "page.md"
     document.parent.mkdir()
     document.write_text("My own notes.")
     with pytest.raises(InputError, match=r"page\.md"):
         run_experiment(config, QUIET)
-    assert measured == []
+    assert measure_calls == []
     assert document.read_text() == "My own notes."
 
 
-def test_experiments_share_a_folder_and_ignore_results_of_other_evaluations(measured, tmp_path):
-    first = make_config(tmp_path, agents={"a": {}}, measure={"shifts": ["*"]})
-    second = make_config(tmp_path, agents={"b": {}}, measure={"shifts": ["*"]})
-    run_experiment(first, QUIET)
-    run_experiment(second, QUIET)
-    assert load_results(first)["val"].distinct("run") == ["a", "b"]
-    assert load_results(dataclasses.replace(first, episodes=7)) == {}
+def test_experiments_share_a_folder_and_ignore_results_of_other_evaluations(measure_calls, tmp_path):
+    first_config = make_config(tmp_path, agents={"a": {}}, measure={"shifts": ["*"]})
+    second_config = make_config(tmp_path, agents={"b": {}}, measure={"shifts": ["*"]})
+    run_experiment(first_config, QUIET)
+    run_experiment(second_config, QUIET)
+    assert load_results(first_config)["val"].distinct("run") == ["a", "b"]
+    assert load_results(dataclasses.replace(first_config, episodes=7)) == {}
 
 
 # Parts of real measurements
 
 
-def parts_of(config: ExperimentConfig) -> dict[str, Part]:
+def parts_by_name(config: ExperimentConfig) -> dict[str, Part]:
     return {part.name: part for part in list_parts(config, Bench(config, QUIET))}
 
 
+def changed_parts(settings: dict[str, dict], other_settings: dict[str, dict]) -> set[str]:
+    """Names of the parts whose settings differ."""
+    return {name for name in settings if settings[name] != other_settings[name]}
+
+
 def test_parts_depend_on_the_agents_that_they_compare(tmp_path):
-    def settings_of(other_seed: int, variant: str = "stde", shape: str = "layout") -> dict[str, dict]:
+    def settings_by_part(other_seed: int, variant: str = "stde") -> dict[str, dict]:
         config = make_config(
             tmp_path,
             agents={"a": {"against": ["b"]}, "b": {"seed": other_seed}, "c": {}, "anonymous": {"seed": other_seed}},
             measure={"evaluation": ["a", "c"], "groups": ["c"], "account": ["a"], "trials": ["a"]},
-            groups={"all": {"agents": ["b"], "variant": variant, "against": shape}},
+            groups={"all": {"agents": ["b"], "variant": variant, "against": "layout"}},
         )
-        return {name: part.settings for name, part in parts_of(config).items()}
+        return {name: part.settings for name, part in parts_by_name(config).items()}
 
     # The evaluation of `a` is compared with `b`, the group holds `b`, and the account is against `anonymous`.
-    before = settings_of(0)
-    after = settings_of(1)
-    assert {name for name in before if before[name] != after[name]} == {
-        "near-a-evaluation",
-        "near-c-groups",
-        "near-a-account",
-    }
-    # Groups depend on what they compare.
-    other_group = settings_of(0, variant="tde")
-    assert {name for name in before if before[name] != other_group[name]} == {"near-c-groups"}
-    assert list(before) == [
+    settings = settings_by_part(0)
+    expected_parts = {"near-a-evaluation", "near-c-groups", "near-a-account"}
+    assert changed_parts(settings, settings_by_part(1)) == expected_parts
+
+    # A group depends on the variants that it compares.
+    assert changed_parts(settings, settings_by_part(0, variant="tde")) == {"near-c-groups"}
+    assert list(settings) == [
         *("near-a-evaluation", "near-c-evaluation", "near-c-groups", "near-a-account"),
         *("near-a-trials-0", "near-a-trials-0.5"),
     ]
@@ -308,7 +322,7 @@ def test_parts_depend_on_the_agents_that_they_compare(tmp_path):
 # Whole experiments
 
 
-def experiment_file(folder: Path, text: str) -> Path:
+def write_experiment(folder: Path, text: str) -> Path:
     path = folder / "experiment.yaml"
     path.write_text(text)
     return path
@@ -317,9 +331,11 @@ def experiment_file(folder: Path, text: str) -> Path:
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_an_experiment_from_training_to_its_page(tmp_path, capsys):
-    base = "".join(f"  {line}\n" for line in CONFIG_YAML.strip().splitlines() if not line.startswith("seeds"))
+    # The settings of the tiny run, without its seeds, are the base of the runs.
+    base_lines = [f"  {line}\n" for line in CONFIG_YAML.strip().splitlines() if not line.startswith("seeds")]
+    base = "".join(base_lines)
     document = tmp_path / "docs" / "page.md"
-    path = experiment_file(
+    path = write_experiment(
         tmp_path,
         f"""
 results: {tmp_path / "results"}
@@ -340,12 +356,12 @@ base:
     assert command.main([str(path)]) == 0
     capsys.readouterr()
 
-    # The runs are what their settings say, and the numbers those of their evaluation.
+    # The runs have the settings of the file, and the stored scores equal those of an evaluation.
     run = Run.open(tmp_path / "runs" / "near-main")
     assert Run.open(tmp_path / "runs" / "near-anonymous").config.method == "anonymous"
-    expected = jaxnav.evaluate(run, shift=0.0, episodes=24, form=("residual",))
+    expected_results = jaxnav.evaluate(run, shift=0.0, episodes=24, form=("residual",))
     table = load_results(apply_yaml(ExperimentConfig(), path))["val"]
-    for row in expected.report["rows"]:
+    for row in expected_results.report["rows"]:
         if row["variant"] in ("baseline", "layout"):
             fields = {
                 "world": "near",
@@ -354,18 +370,22 @@ base:
                 "decoding": row["decoding"],
                 "shift": 0.0,
             }
-            # Files have seven digits.
+            # Files hold seven digits.
             assert table.find(fields, metric="sr").mean == pytest.approx(row["sr"]["mean"], rel=1e-6)
             assert table.has(fields, reference="anonymous", metric="sr")
-    assert table.find(world="near", run="main", metric="training (s)").mean == pytest.approx(
-        run.times()[-1]["wall_s"], rel=1e-6
-    )
+    training_time = table.find(world="near", run="main", metric="training (s)").mean
+    assert training_time == pytest.approx(run.times()[-1]["wall_s"], rel=1e-6)
     assert "near: main, val" in document.read_text()
 
-    # Nothing is done again.
-    before = contents(tmp_path)
+    # The second command changes no file.
+    files_before = contents(tmp_path)
     assert command.main([str(path)]) == 0
-    assert contents(tmp_path) == before
+    assert contents(tmp_path) == files_before
+
+
+def files_below(folder: Path, name: str) -> dict[str, bytes]:
+    """Bytes of the files of a folder whose relative path begins with a name."""
+    return {path: data for path, data in contents(folder).items() if path.startswith(name)}
 
 
 @pytest.mark.exhaustive
@@ -377,7 +397,7 @@ def test_a_killed_experiment_goes_on_to_the_same_files(drawn_run, tmp_path):
     def start(folder: Path):
         folder.mkdir(exist_ok=True)
         run = f"{{run: {drawn_run.config.run_dir}}}"
-        path = experiment_file(
+        path = write_experiment(
             folder,
             f"""
 results: {folder / "results"}
@@ -390,24 +410,27 @@ episodes: 8
         )
         return start_python(["-m", "jaxnav", "study", path])
 
-    # Killed once the first of two parts is there.
-    killed, whole = tmp_path / "killed", tmp_path / "whole"
-    first_part = results_of(killed) / "near-a-evaluation.jsonl"
-    process = start(killed)
+    # Kill the process once the first of two parts is written.
+    killed_folder = tmp_path / "killed"
+    complete_folder = tmp_path / "complete"
+    first_part = results_folder(killed_folder) / "near-a-evaluation.jsonl"
+    process = start(killed_folder)
     while process.poll() is None and not first_part.exists():
         time.sleep(0.01)
     process.kill()
     process.communicate()
     assert process.returncode == -signal.SIGKILL
-    assert [path.name for path in results_of(killed).glob("*.jsonl")] == [first_part.name]
-    written = first_part.stat().st_mtime_ns
+    assert [path.name for path in results_folder(killed_folder).glob("*.jsonl")] == [first_part.name]
+    modified_ns = first_part.stat().st_mtime_ns
 
-    # Left alone, it ends with the same files; the first part is not measured again.
-    for folder in (killed, whole):
+    # The next process finishes the experiment and does not measure the first part again. Its files equal those of an
+    # uninterrupted experiment.
+    for folder in (killed_folder, complete_folder):
         process = start(folder)
         _, error = process.communicate()
         assert process.returncode == 0, error
-    assert first_part.stat().st_mtime_ns == written
+    assert first_part.stat().st_mtime_ns == modified_ns
     for name in ("page.md", "results"):
-        killed_files = {path: data for path, data in contents(killed).items() if path.startswith(name)}
-        assert killed_files == {path: data for path, data in contents(whole).items() if path.startswith(name)} != {}
+        complete_files = files_below(complete_folder, name)
+        assert complete_files != {}
+        assert files_below(killed_folder, name) == complete_files

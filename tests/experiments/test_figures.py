@@ -1,4 +1,4 @@
-"""Figures draw and name the numbers they are given."""
+"""Figures of experiments: drawn data, labels and styles, and the rows of results that they are drawn from."""
 
 import io
 from collections.abc import Callable
@@ -26,7 +26,7 @@ METRICS = ("sr", "spl", "dts")
 
 
 def make_interval(mean: float, half_width: float = 1.0) -> Interval:
-    """Interval of three seeds that lie one apart."""
+    """Interval with three seeds at a distance of 1."""
     return Interval(mean, mean - half_width, mean + half_width, 1.0, (mean - 1.0, mean, mean + 1.0))
 
 
@@ -113,7 +113,7 @@ def assert_first_line_is_level(axes: Axes, level: float) -> None:
     np.testing.assert_array_equal(np.asarray(axes.get_lines()[0].get_ydata()), [level, level])
 
 
-# One figure each
+# Figures of given data
 
 
 def test_the_similarity_figure_shows_points_sizes_and_means(monkeypatch):
@@ -126,8 +126,8 @@ def test_the_similarity_figure_shows_points_sizes_and_means(monkeypatch):
     # Areas are in the ratio of the episodes, 4 : 8 : 2 : 4.
     np.testing.assert_allclose(points.get_sizes(), figures.MAX_MARKER_AREA * np.array([0.5, 1.0, 0.25, 0.5]))
 
-    # Halves by similarity, weighted by episodes: (0.1 * 8 + 0.3 * 4) / 12 = 1/6 and (25 * 8 + 75 * 4) / 12 = 125/3;
-    # (0.5 * 2 + 0.9 * 4) / 6 = 23/30 and (50 * 2 + 100 * 4) / 6 = 250/3.
+    # Means of both halves of the similarity, weighted by episodes: (0.1 * 8 + 0.3 * 4) / 12 = 1/6 and
+    # (25 * 8 + 75 * 4) / 12 = 125/3; (0.5 * 2 + 0.9 * 4) / 6 = 23/30 and (50 * 2 + 100 * 4) / 6 = 250/3.
     np.testing.assert_allclose(marked_lines(axes)[0], [[1 / 6, 125 / 3], [23 / 30, 250 / 3]])
     title = axes.get_title(loc="left")
     assert "0.50 [0.40, 0.60]" in title
@@ -170,7 +170,7 @@ def test_the_gap_figure_has_a_panel_by_estimator():
         for index, curve in enumerate(GAP_LINES.values()):
             assert_curve(axes, index, curve)
 
-        # The marker stands for the shift, the dash for the belief.
+        # The marker shows the shift, and the dash shows the belief.
         lines = [line for line in axes.get_lines() if line.get_marker() != "None"]
         assert [line.get_linestyle() for line in lines] == ["-", "--", "-", "--"]
         assert lines[0].get_marker() == lines[1].get_marker() != lines[2].get_marker() == lines[3].get_marker()
@@ -185,7 +185,7 @@ def test_the_auc_figure_has_a_line_by_estimator():
     assert legend_texts(figure)[:2] == ["calibrated", "evidence"]
 
 
-def test_more_lines_than_styles_can_be_told_apart():
+def test_more_lines_than_styles_are_distinguishable():
     curve_by_estimator = {f"estimator {index}": make_curve(0.5, 0.6, 0.7) for index in range(9)}
     (axes,) = figures.auc_figure(curve_by_estimator).axes
     lines = [line for line in axes.get_lines() if line.get_marker() != "None"]
@@ -200,30 +200,37 @@ def test_more_lines_than_styles_can_be_told_apart():
 
 
 def test_the_effects_figure_fills_markers_whose_interval_excludes_zero():
-    first, second = DRAWINGS["effects"]().axes
-    np.testing.assert_allclose(np.concatenate(marked_lines(first)), [[3, 0], [-1, 1]])
+    first_axes, second_axes = DRAWINGS["effects"]().axes
+    np.testing.assert_allclose(np.concatenate(marked_lines(first_axes)), [[3, 0], [-1, 1]])
 
-    # 3 +- 1, -1 +- 2 and, in the other panel, -4 +- 1.5.
-    bars = [artist for artist in first.collections if isinstance(artist, LineCollection)]
-    assert [(start[0], end[0]) for bar in bars for start, end in bar.get_segments()] == [(2, 4), (-3, 1)]
-    markers = [line for axes in (first, second) for line in axes.get_lines()[1:]]
+    # The intervals of the first panel are 3 +- 1 and -1 +- 2.
+    limits = []
+    for artist in first_axes.collections:
+        if isinstance(artist, LineCollection):
+            limits += [(start[0], end[0]) for start, end in artist.get_segments()]
+    assert limits == [(2, 4), (-3, 1)]
+
+    # In both panels, the intervals 3 +- 1 and -4 +- 1.5 exclude zero, and -1 +- 2 does not.
+    markers = [*first_axes.get_lines()[1:], *second_axes.get_lines()[1:]]
     assert [marker.get_markerfacecolor() != "white" for marker in markers] == [True, False, True]
 
     # The first effect is at the top, with its numbers next to it.
-    assert [text.get_text() for text in first.get_yticklabels()] == ["+ w", "sTDE"]
-    assert first.yaxis_inverted()
-    assert first.texts[0].get_text() == "+3.0 [+2.0, +4.0]"
+    assert [text.get_text() for text in first_axes.get_yticklabels()] == ["+ w", "sTDE"]
+    assert first_axes.yaxis_inverted()
+    assert first_axes.texts[0].get_text() == "+3.0 [+2.0, +4.0]"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", DRAWINGS)
 def test_equal_data_gives_equal_bytes(name, tmp_path):
     figure = DRAWINGS[name]()
-    paths = [tmp_path / file for file in ("first.png", "again.png", "redrawn.png")]
+    paths = [tmp_path / file_name for file_name in ("first.png", "again.png", "redrawn.png")]
     save_figure(figure, paths[0])
     save_figure(figure, paths[1])
     save_figure(DRAWINGS[name](), paths[2])
     assert len({path.read_bytes() for path in paths}) == 1
+
+    # The files have the size of figures.
     with Image.open(io.BytesIO(paths[0].read_bytes())) as png:
         assert png.width == FIGURE_WIDTH * FIGURE_DPI
         assert not set(png.info) - {"dpi"}  # neither a date nor a version
@@ -240,11 +247,15 @@ def test_all_text_is_inside_the_figure(name):
     assert box.y1 <= figure.get_figheight()
 
 
+def grey_level(color: str) -> float:
+    """Luma of ITU-R BT.601 of a color `#rrggbb`."""
+    rgb = [int(color[start : start + 2], 16) for start in (1, 3, 5)]
+    return float(np.array(rgb) @ (0.299, 0.587, 0.114))
+
+
 def test_neighbouring_line_styles_differ_in_grey():
-    colors = [style["color"] for style in figures.LINE_STYLES]
-    rgb = [[int(color[start : start + 2], 16) for start in (1, 3, 5)] for color in colors]
-    grey = np.array(rgb) @ (0.299, 0.587, 0.114)  # luma of ITU-R BT.601
-    assert (np.abs(np.diff(grey[:4])) > 35).all()
+    grey_levels = [grey_level(style["color"]) for style in figures.LINE_STYLES]
+    assert (np.abs(np.diff(grey_levels[:4])) > 35).all()
     assert len({style["marker"] for style in figures.LINE_STYLES}) == len(figures.LINE_STYLES)
 
 
@@ -263,9 +274,9 @@ def test_the_similarity_figures_are_drawn_from_rows_by_point_and_category():
     stde = {"variant": "stde", "decoding": "argmax", "form": "residual", "epsilon": 0.5}
     for shift, success in SUCCESS.items():
         baseline = {"variant": "baseline", "shift": shift}
-        undefined = np.full(4, np.nan)
+        no_bounds = np.full(4, np.nan)
         for metric, values in (("sr", success.success), ("episodes", success.episodes)):
-            curve = Curve(success.similarity, values, undefined, undefined)
+            curve = Curve(success.similarity, values, no_bounds, no_bounds)
             rows.append({**baseline, "metric": f"{metric} by similarity", "value": curve})
         for index, category in enumerate(GAIN.categories):
             for metric in ("similarity", "baseline", "gain"):
@@ -276,8 +287,8 @@ def test_the_similarity_figures_are_drawn_from_rows_by_point_and_category():
 
     # Fig. 4 has a panel by shift.
     figure = figures.FIGURES["fig4"](table, SHIFTS, FIELDS)
-    for axes, expected in zip(figure.axes, DRAWINGS["similarity"]().axes, strict=True):
-        np.testing.assert_allclose(marked_lines(axes), marked_lines(expected))
+    for axes, expected_axes in zip(figure.axes, DRAWINGS["similarity"]().axes, strict=True):
+        np.testing.assert_allclose(marked_lines(axes), marked_lines(expected_axes))
 
     # Fig. 5 has two panels by shift; the gains at the second are one point more.
     axes = figures.FIGURES["fig5"](table, SHIFTS, FIELDS).axes
@@ -294,36 +305,39 @@ def test_the_epsilon_figure_is_drawn_from_sweeps_with_best_actions():
             for metric, interval in metrics.items():
                 rows.append({**sweep, "decoding": "argmax", "metric": metric, "value": interval})
 
-                # Sampled actions, controls, other gaps and differences are no part of it.
-                for other in ({"decoding": "sample"}, {"control": "noise"}, {"gap": "clock"}, {"reference": "layout"}):
-                    other_row = {**sweep, "decoding": "argmax", "metric": metric, **other}
+                # The figure ignores sampled actions, controls, further gaps and differences.
+                for change in ({"decoding": "sample"}, {"control": "noise"}, {"gap": "clock"}, {"reference": "layout"}):
+                    other_row = {**sweep, "decoding": "argmax", "metric": metric, **change}
                     rows.append({**other_row, "value": make_interval(7.0), "epsilon": 0.25})
     figure = figures.FIGURES["fig6a"](make_table(*rows), SHIFTS, FIELDS)
-    for axes, expected in zip(figure.axes, DRAWINGS["epsilon"]().axes, strict=True):
-        np.testing.assert_allclose(marked_lines(axes), marked_lines(expected))
+    for axes, expected_axes in zip(figure.axes, DRAWINGS["epsilon"]().axes, strict=True):
+        np.testing.assert_allclose(marked_lines(axes), marked_lines(expected_axes))
 
 
 @pytest.mark.slow
 def test_the_gap_figures_are_drawn_from_curves_of_the_outer_shifts():
     shifts = (0.0, 0.5, 1.0)
+    ignored_curve = make_curve(9, 9, 9, 9)
     rows = []
     for shift in shifts:
         for setting in GAPS:
             for belief in BELIEFS:
-                curve = GAP_LINES[shift, belief] if shift in SHIFTS else make_curve(9, 9, 9, 9)
+                curve = GAP_LINES[shift, belief] if shift in SHIFTS else ignored_curve
                 rows.append({"shift": shift, "variant": setting, "control": belief, "metric": "gap", "value": curve})
         for setting, auc in AUCS.items():
-            curve = auc if shift == 1.0 else make_curve(9, 9, 9, 9)
+            curve = auc if shift == 1.0 else ignored_curve
             rows.append({"shift": shift, "variant": setting, "control": "updated", "metric": "gap auc", "value": curve})
     table = make_table(*rows)
+
+    # Gaps are drawn at the first and the last shift, AUCs at the last.
     for name, drawing in (("fig6b", "gap"), ("auc", "auc")):
         figure = figures.FIGURES[name](table, shifts, FIELDS)
-        for axes, expected in zip(figure.axes, DRAWINGS[drawing]().axes, strict=True):
-            np.testing.assert_allclose(marked_lines(axes), marked_lines(expected))
+        for axes, expected_axes in zip(figure.axes, DRAWINGS[drawing]().axes, strict=True):
+            np.testing.assert_allclose(marked_lines(axes), marked_lines(expected_axes))
 
 
 def test_the_effects_figure_is_drawn_from_differences_to_the_layout():
-    # One effect for each threshold and gap, and shift.
+    # Each form with its threshold, each gap and each shift have their own effect.
     rows = []
     effects = {("residual", 0.5, "novelty"): 1, ("residual", 0.5, "evidence"): 2}
     effects |= {("paper", 0.0, "novelty"): 3, ("paper", 0.0, "evidence"): 4}
@@ -334,5 +348,5 @@ def test_the_effects_figure_is_drawn_from_differences_to_the_layout():
             rows.append({**stde, **difference, "value": make_interval(effect + 10 * shift)})
     figure = figures.FIGURES["effects"](make_table(*rows), SHIFTS, FIELDS)
     for axes, shift in zip(figure.axes, SHIFTS, strict=True):
-        drawn = [float(points[0, 0]) for points in marked_lines(axes)]
-        assert drawn == [1 + 10 * shift, 2 + 10 * shift, 3 + 10 * shift, 4 + 10 * shift]
+        drawn_effects = [float(points[0, 0]) for points in marked_lines(axes)]
+        assert drawn_effects == [1 + 10 * shift, 2 + 10 * shift, 3 + 10 * shift, 4 + 10 * shift]

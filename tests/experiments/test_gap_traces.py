@@ -1,4 +1,4 @@
-"""The layout gap along walks: traces against a plain loop and closed forms, statistics against SciPy and by hand."""
+"""Layout gaps along walks: traces equal a plain loop and closed forms, statistics equal SciPy and worked values."""
 
 import functools
 
@@ -37,21 +37,21 @@ from jaxnav.scenes.task import DONE, LOOK_UP
 VALUES = st.lists(st.integers(-3, 3), min_size=1, max_size=20).map(np.array)
 
 
-def plain_auc(positive: np.ndarray, negative: np.ndarray) -> float:
+def unweighted_auc(positive: np.ndarray, negative: np.ndarray) -> float:
     """AUC where all weights are 1."""
     return weighted_auc(positive, negative, np.ones((len(positive), 1)), np.ones((len(negative), 1)))[0]
 
 
 def test_auc_counts_pairs_won_and_half_of_the_ties():
-    # Against 2: lost, tied, tied; against 0: all three won. (0.5 + 0.5 + 3) / 6.
-    assert plain_auc(np.array([1, 2, 2]), np.array([2, 0])) == pytest.approx(4 / 6)
+    # Against 2, the values 1, 2 and 2 lose once and tie twice; against 0 all three win: (0.5 + 0.5 + 3) / 6.
+    assert unweighted_auc(np.array([1, 2, 2]), np.array([2, 0])) == pytest.approx(4 / 6)
 
 
 @given(VALUES, VALUES)
 def test_auc_is_the_statistic_of_mann_and_whitney(positive, negative):
     expected = mannwhitneyu(positive, negative).statistic / (len(positive) * len(negative))
-    assert plain_auc(positive, negative) == pytest.approx(expected)
-    assert plain_auc(negative, positive) == pytest.approx(1 - expected)
+    assert unweighted_auc(positive, negative) == pytest.approx(expected)
+    assert unweighted_auc(negative, positive) == pytest.approx(1 - expected)
 
 
 # Statistics by step
@@ -76,7 +76,8 @@ def first_step(curves: np.ndarray) -> tuple[float, float, float]:
 def test_intervals_by_step_are_those_of_a_plain_loop():
     # Six scenes, in another order and with more episodes at the shift; some episodes end early.
     rng = np.random.default_rng(2)
-    num_runs, num_scenes = 3, 6
+    num_runs = 3
+    num_scenes = 6
     unshifted_scene = np.repeat(np.arange(num_scenes), 4)
     unshifted = make_traces(
         rng.integers(0, 9, (num_runs, 24, 2)) / 10, unshifted_scene, running=rng.random((num_runs, 24, 2)) < 0.8
@@ -88,32 +89,35 @@ def test_intervals_by_step_are_those_of_a_plain_loop():
     )
 
     def remaining_gaps(traces: GapTraces, step: int, scene: int | None, run: int | None) -> np.ndarray:
-        """Gaps of the episodes that still run, without a scene and a run."""
+        """Gaps of the running episodes, without those of a scene and of a run."""
         name = None if scene is None else f"room{scene:02}"
-        other_scene = np.array([traces.episodes.scenes[index] != name for index in traces.episodes.scene])
-        other_run = np.arange(num_runs)[:, None] != run
-        return traces.gap[0, UPDATED, ..., step][traces.running[..., step] & other_scene & other_run]
+        is_other_scene = np.array([traces.episodes.scenes[index] != name for index in traces.episodes.scene])
+        is_other_run = np.arange(num_runs)[:, None] != run
+        return traces.gap[0, UPDATED, ..., step][traces.running[..., step] & is_other_scene & is_other_run]
 
+    def auc_without(step, scene, run):
+        shifted_gaps = remaining_gaps(shifted, step, scene, run)
+        unshifted_gaps = remaining_gaps(unshifted, step, scene, run)
+        num_pairs = len(shifted_gaps) * len(unshifted_gaps)
+        return mannwhitneyu(shifted_gaps, unshifted_gaps).statistic / num_pairs
+
+    def mean_without(step, scene, run):
+        return remaining_gaps(unshifted, step, scene, run).mean(dtype=float)
+
+    # The jackknife leaves out each scene and each run of both shifts at once.
     aucs = auc_by_step(shifted, unshifted)
     means = mean_by_step(unshifted)
     for step in (0, 1):
-
-        def auc_without(scene, run, step=step):
-            shifted_gaps = remaining_gaps(shifted, step, scene, run)
-            unshifted_gaps = remaining_gaps(unshifted, step, scene, run)
-            pairs = len(shifted_gaps) * len(unshifted_gaps)
-            return mannwhitneyu(shifted_gaps, unshifted_gaps).statistic / pairs
-
-        def mean_without(scene, run, step=step):
-            return remaining_gaps(unshifted, step, scene, run).mean(dtype=float)
-
-        assert aucs[:, 0, UPDATED, step] == pytest.approx(left_out(auc_without, num_scenes, num_runs))
-        assert means[:, 0, FROZEN, step] == pytest.approx(left_out(mean_without, num_scenes, num_runs), rel=1e-5)
+        expected_auc = left_out(functools.partial(auc_without, step), num_scenes, num_runs)
+        expected_mean = left_out(functools.partial(mean_without, step), num_scenes, num_runs)
+        assert aucs[:, 0, UPDATED, step] == pytest.approx(expected_auc)
+        assert means[:, 0, FROZEN, step] == pytest.approx(expected_mean, rel=1e-5)
 
 
-def test_calibration_compares_the_mean_gap_of_each_bin_with_the_share_of_shifted_episodes():
-    # Of the gaps in [0.9, 1], 2 of 3 are of shifted episodes, and their mean is 0.95; in [0.1, 0.2), 1 of 3, with
-    # a mean of 0.13. So the error is (3 x |0.95 - 2 / 3| + 3 x |0.13 - 1 / 3|) / 6. Ended episodes do not count.
+def test_calibration_compares_mean_gaps_of_bins_with_shares_of_shifted_episodes():
+    # Of the gaps in [0.9, 1], 2 of 3 are of shifted episodes, and their mean is 0.95; of those in [0.1, 0.2), 1 of 3
+    # is, and their mean is 0.13. So the error is (3 x |0.95 - 2 / 3| + 3 x |0.13 - 1 / 3|) / 6. Ended episodes do not
+    # count.
     shifted = make_traces([[[0.9], [1.0], [0.11], [0.5]]], [0, 1, 2, 3], running=[[[True], [True], [True], [False]]])
     unshifted = make_traces(
         [[[0.95], [0.13], [0.15], [0.5]]], [0, 1, 2, 3], running=[[[True], [True], [True], [False]]]
@@ -127,16 +131,17 @@ def test_calibration_compares_the_mean_gap_of_each_bin_with_the_share_of_shifted
 @pytest.mark.slow
 def test_a_gap_drawn_from_its_own_probability_is_calibrated():
     # An episode with gap D is shifted with probability D. The share in a bin of 4,000 episodes has a standard
-    # deviation of at most 0.8 points. The square of the gap has the same order and another level.
+    # deviation of at most 0.8 points. The square of the gap keeps the order of the episodes and changes the level.
     rng = np.random.default_rng(0)
     gap = rng.random(40_000)
     is_shifted = rng.random(40_000) < gap
 
     def calibrate(values):
-        def side_traces(side: np.ndarray) -> GapTraces:
-            return make_traces(np.tile(side[:, None], (2, 1, 1)), np.arange(len(side)) % 20)
+        def tile_traces(gaps: np.ndarray) -> GapTraces:
+            return make_traces(np.tile(gaps[:, None], (2, 1, 1)), np.arange(len(gaps)) % 20)
 
-        shifted, unshifted = side_traces(values[is_shifted]), side_traces(values[~is_shifted])
+        shifted = tile_traces(values[is_shifted])
+        unshifted = tile_traces(values[~is_shifted])
         ((calibration,),) = calibration_at_steps(shifted, unshifted, [0]).values()
         return calibration
 
@@ -144,14 +149,15 @@ def test_a_gap_drawn_from_its_own_probability_is_calibrated():
     assert len(calibrated.shifted_share.mean) == 10
     np.testing.assert_allclose(calibrated.shifted_share.mean, calibrated.shifted_share.positions, atol=0.04)
     assert calibrated.error.mean < 0.02
+
     # The mean of |D^2 - D| over uniform D is 1 / 2 - 1 / 3.
     assert calibrate(gap**2).error.mean == pytest.approx(1 / 6, abs=0.01)
 
 
 def test_scenes_of_a_floor_plan_are_left_out_of_both_shifts_at_once():
-    # Scene i has a gap of i / 20 unshifted, a little more shifted. Of n scenes, each wins against itself and all below:
-    # AUC = (1 + 1 / n) / 2. Without a scene and its twin it is (1 + 1 / 19) / 2, whichever scene it is, so scenes have
-    # a variance of 19 / 20 x 20 x (0.5 / 19 - 0.5 / 20)^2, the runs none.
+    # The gap of scene i is i / 20 unshifted and a little more shifted. Of n scenes, each wins against itself and all
+    # lower ones: AUC = (1 + 1 / n) / 2. Without any one scene and its twin the AUC is (1 + 1 / 19) / 2, so scenes have
+    # a variance of 19 / 20 x 20 x (0.5 / 19 - 0.5 / 20)^2, and runs have none.
     scenes = np.arange(20)
     unshifted = make_traces(np.tile(scenes[:, None] / 20, (2, 1, 1)), scenes)
     reversed_names = unshifted.episodes.scenes[::-1]
@@ -159,18 +165,19 @@ def test_scenes_of_a_floor_plan_are_left_out_of_both_shifts_at_once():
     variance = 19 * (0.5 / 19 - 0.5 / 20) ** 2
     assert first_step(auc_by_step(shifted, unshifted)) == pytest.approx(around(0.525, variance, 19))
 
-    # Copies of a floor plan with other objects are left out together, other floor plans are not.
-    for name_format, same_plans in (("room{:02}-replaced-1", True), ("other{:02}", False)):
+    # Copies of a floor plan with other objects are left out with it; other floor plans are not.
+    for name_format, has_same_plans in (("room{:02}-replaced-1", True), ("other{:02}", False)):
         names = tuple(name_format.format(scene) for scene in scenes)
-        replaced = make_traces(np.tile(scenes[:, None] / 20 + 0.01, (2, 1, 1)), scenes, names=names)
-        mean, low, _ = first_step(auc_by_step(replaced, unshifted))
+        renamed_traces = make_traces(np.tile(scenes[:, None] / 20 + 0.01, (2, 1, 1)), scenes, names=names)
+        mean, low, _ = first_step(auc_by_step(renamed_traces, unshifted))
         assert mean == pytest.approx(0.525)
-        assert (low > 0.5) == same_plans
+        assert (low > 0.5) == has_same_plans
 
 
 def test_room_types_keep_their_shares():
-    # Kitchens at 0.1 and 0.3, bedrooms at 0.6, 0.7 and 0.8, alike in two runs: sample variances 0.02 and 0.01, so
-    # (2 / 5)^2 0.02 / 2 + (3 / 5)^2 0.01 / 3 = 0.0028 of the mean. In one stratum it would be 0.085 / 5.
+    # Kitchens have gaps of 0.1 and 0.3, bedrooms of 0.6, 0.7 and 0.8, equal in two runs. With sample variances of 0.02
+    # and 0.01, the mean has a variance of (2 / 5)^2 0.02 / 2 + (3 / 5)^2 0.01 / 3 = 0.0028. A single stratum would give
+    # 0.085 / 5.
     gaps = np.tile(np.array([0.1, 0.3, 0.6, 0.7, 0.8])[:, None], (2, 1, 1))
     for room, variance, degrees in (([1, 1, 0, 0, 0], 0.0028, 3), ([1, 1, 1, 1, 1], 0.085 / 5, 4)):
         means = mean_by_step(make_traces(gaps, range(5), room=room))
@@ -182,18 +189,18 @@ def test_a_policy_is_left_out_of_both_shifts_at_once():
     shifted = make_traces(np.repeat([[0.9], [0.3]], 3, axis=1)[..., None], range(3))
     unshifted = make_traces(np.repeat([[0.5], [0.3]], 3, axis=1)[..., None], range(3))
 
-    # 0.9 > 0.5 and 0.3, 0.3 < 0.5, 0.3 = 0.3: 2.5 of 4. The second alone has 0.5, the first 1: by run
-    # 1 / 2 x (0.125^2 + 0.375^2), with one degree of freedom.
+    # 0.9 > 0.5 and 0.3, 0.3 < 0.5, 0.3 = 0.3: 2.5 of 4. The AUC of the second policy is 0.5, that of the first is 1, so
+    # the variance by run is 1 / 2 x (0.125^2 + 0.375^2), with one degree of freedom.
     variance = 0.5 * (0.125**2 + 0.375**2)
     assert first_step(auc_by_step(shifted, unshifted)) == pytest.approx(around(0.625, variance, 1))
 
     # Equal policies show no variance.
-    equal = make_traces(np.repeat([[0.9], [0.9]], 3, axis=1)[..., None], range(3))
-    assert first_step(mean_by_step(equal)) == pytest.approx([0.9, 0.9, 0.9])
+    equal_traces = make_traces(np.repeat([[0.9], [0.9]], 3, axis=1)[..., None], range(3))
+    assert first_step(mean_by_step(equal_traces)) == pytest.approx([0.9, 0.9, 0.9])
 
 
 def test_only_running_episodes_count():
-    # At step 1 one episode of one run still runs: its scene and run cannot be left out. At step 2 none does.
+    # At step 1 only one episode of one run is running, so its scene and run cannot be left out; at step 2 none is.
     running = [[[True, True, False], [True, False, False], [True, False, False]], [[True, False, False]] * 3]
     shifted = make_traces([[[0.5, 0.5, 9], [0.1, 9, 9], [0.3, 9, 9]]] * 2, range(3), running=running)
     unshifted = make_traces([[[0.3, 0.6, 0.0], [0.3, 0.4, 0.0], [0.3, 0.5, 0.0]]] * 2, range(3))
@@ -223,10 +230,10 @@ def test_the_auc_of_noise_is_a_half_and_that_of_a_shift_is_not():
 
 
 def test_traces_end_with_the_last_step_that_every_shift_reaches():
-    # One side has episodes of two and three steps, the other of one and two: two steps are left.
-    longer = make_traces(np.zeros((1, 2, 4)), range(2), running=[[[1, 1, 0, 0], [1, 1, 1, 0]]])
-    shorter = make_traces(np.zeros((1, 2, 4)), range(2), running=[[[1, 0, 0, 0], [1, 1, 0, 0]]])
-    for traces in truncate_to_shortest([longer, shorter]):
+    # Episodes of one shift have two and three steps, those of the second one and two: two steps remain.
+    long_traces = make_traces(np.zeros((1, 2, 4)), range(2), running=[[[1, 1, 0, 0], [1, 1, 1, 0]]])
+    short_traces = make_traces(np.zeros((1, 2, 4)), range(2), running=[[[1, 0, 0, 0], [1, 1, 0, 0]]])
+    for traces in truncate_to_shortest([long_traces, short_traces]):
         assert traces.gap.shape == (1, 2, 1, 2, 2)
         assert traces.running.shape == (1, 2, 2)
 
@@ -237,7 +244,7 @@ ENV, ENV_PARAMS = tiny.world()
 AGENT_LOOP = AgentLoop(ENV, tiny.SPEC, tiny.ESTIMATOR)
 KNOWLEDGE = tiny.knowledge()
 UNGATED = EstimatorConfig(gate=False)
-#: `paper` sees every row, `calibrated` has a gate that shuts, UNGATED has none; each has another prior.
+#: `paper` updates on every row, `calibrated` has a gate that shuts, UNGATED has no gate. Their priors differ.
 ESTIMATORS = ("paper", "calibrated", UNGATED)
 PRIORS = jnp.stack([KNOWLEDGE.layout, 0.3 * KNOWLEDGE.layout, 2 * KNOWLEDGE.layout])
 NUM_STEPS = max(tiny.STEP_LIMITS) + 1
@@ -246,20 +253,25 @@ WEIGHTS = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(tiny.random_param
 
 
 def detected_categories(pose) -> np.ndarray:
-    """Categories that are detected at poses, bool [..., K]."""
+    """True for the categories that are detected at poses, bool [..., K]."""
     return RowFormat(len(tiny.CATEGORIES)).presence(tiny.BANK.rows[pose])
 
 
 def draw_walks() -> EpisodeList:
     """Five episodes in each scene, of which two start with a level view of two categories or more."""
-    drawn = draw_episodes(tiny.BANK, 10, seed=1)
+    episodes = draw_episodes(tiny.BANK, 10, seed=1)
+
+    # Level poses with a view of two categories or more; those of scene 1, the bedroom, come last.
     poses = np.arange(len(tiny.BANK.rows))
     is_level = poses % len(tiny.BANK.task.rules.horizons) == 0
     poses = poses[is_level & (detected_categories(poses).sum(axis=1) >= 2)]
-    in_bedroom = poses >= tiny.BANK.first_cell[1] * tiny.POSES_PER_CELL
+    is_in_bedroom = poses >= tiny.BANK.first_cell[1] * tiny.POSES_PER_CELL
+
+    # The first two episodes of each scene start at the first and the last of these poses.
     for scene in (0, 1):
-        drawn.pose[np.flatnonzero(drawn.scene == scene)[:2]] = poses[in_bedroom == scene][[0, -1]]
-    return drawn
+        first_episodes = np.flatnonzero(episodes.scene == scene)[:2]
+        episodes.pose[first_episodes] = poses[is_in_bedroom == scene][[0, -1]]
+    return episodes
 
 
 EPISODES = draw_walks()
@@ -270,8 +282,8 @@ def walk(weights) -> GapTraces:
     return trace_gaps(weights, EPISODES, ENV_PARAMS, AGENT_LOOP, KNOWLEDGE, ESTIMATORS, PRIORS, NUM_STEPS, KEY)
 
 
-def weights_that_always(action: int):
-    """Policies that take one action only."""
+def single_action_weights(action: int):
+    """Parameters of policies that always take one action."""
     bias = WEIGHTS["actor"]["bias"].at[:, action].set(1e4)
     return WEIGHTS | {"actor": WEIGHTS["actor"] | {"bias": bias}}
 
@@ -279,7 +291,7 @@ def weights_that_always(action: int):
 @pytest.fixture(scope="module")
 def standing_traces() -> GapTraces:
     """Traces of policies that always see one view."""
-    return walk(weights_that_always(LOOK_UP))
+    return walk(single_action_weights(LOOK_UP))
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -289,7 +301,7 @@ def update_belief(estimator, prior, belief, presence):
 
 @jax.jit
 def sample_step(policy_index, episode, time, pose, logits):
-    """The sampled action, and the pose after it."""
+    """Sampled action and next pose."""
     key = jax.random.fold_in(jax.random.fold_in(jax.random.fold_in(KEY, policy_index), episode), time)
     action = jax.random.categorical(key, logits).astype(jnp.int32)
     return action, ENV.next_pose(pose, action, ENV_PARAMS)
@@ -310,13 +322,17 @@ def test_traces_are_those_of_a_plain_loop():
         beliefs = []
         for estimator, prior in zip(ESTIMATORS, PRIORS[:, room], strict=True):
             beliefs.append([LayoutEstimator(prior, estimator).init()] * 2)
-        layout, memory = None, PolicyState(jnp.zeros(tiny.SIZES.hidden), jnp.int32(NO_ACTION))
-        pose, running, time = int(EPISODES.pose[episode]), True, 0
+        layout = None
+        memory = PolicyState(jnp.zeros(tiny.SIZES.hidden), jnp.int32(NO_ACTION))
+        pose = int(EPISODES.pose[episode])
+        running = True
+        time = 0
         while running:
             # Every estimator observes the view; its frozen belief returns to the prior.
             for index, (estimator, prior) in enumerate(zip(ESTIMATORS, PRIORS[:, room], strict=True)):
                 presence = detected_categories(pose)
-                updated, frozen = (update_belief(estimator, prior, belief, presence) for belief in beliefs[index])
+                updated = update_belief(estimator, prior, beliefs[index][UPDATED], presence)
+                frozen = update_belief(estimator, prior, beliefs[index][FROZEN], presence)
                 gaps = traces.gap[index, :, policy_index, episode, time]
                 np.testing.assert_allclose(gaps, [updated.gap, frozen.gap], atol=1e-6)
                 beliefs[index] = [updated, frozen.replace(alpha=prior)]
@@ -348,11 +364,11 @@ def test_the_gap_of_a_view_that_stays_has_a_closed_form(standing_traces):
         for step in range(num_steps):
             divergences = []
             for row, row_counts in zip(prior, counts[presence > 0], strict=True):
-                others = row > 0
-                divergences.append(exact_kl((row + step * row_counts)[others], row_counts[others]))
+                is_other = row > 0
+                divergences.append(exact_kl((row + step * row_counts)[is_other], row_counts[is_other]))
             np.testing.assert_allclose(updated[step], np.tanh(np.mean(divergences)), rtol=2e-4)
 
-        # Frozen, every step is the first again.
+        # The frozen gap is that of the first step at every step.
         frozen = standing_traces.gap[2, FROZEN, 0, episode, :num_steps]
         np.testing.assert_array_equal(frozen, np.full(num_steps, frozen[0]))
         assert frozen[0] == updated[0] > updated[1]
@@ -364,6 +380,6 @@ def test_the_gap_of_a_view_that_stays_has_a_closed_form(standing_traces):
 
 
 def test_episodes_run_to_their_limit_or_to_done(standing_traces):
-    # A limit of L leaves steps 0 ... L - 1; Done at once leaves step 0.
+    # With a limit of L, steps 0 ... L - 1 are running; with Done as the first action, only step 0 is.
     np.testing.assert_array_equal(standing_traces.running[0], np.arange(NUM_STEPS + 1) < STEP_LIMITS[:, None])
-    np.testing.assert_array_equal(walk(weights_that_always(DONE)).running.sum(axis=-1), 1)
+    np.testing.assert_array_equal(walk(single_action_weights(DONE)).running.sum(axis=-1), 1)

@@ -1,4 +1,4 @@
-"""Removal in a mixed population: its comparisons, and their intervals."""
+"""Removal of experience in a mixed population of shifts: metrics, removals, and their comparisons."""
 
 import dataclasses
 
@@ -31,7 +31,10 @@ from jaxnav.experiments.trials import NEVER, TrialRunner
 from jaxnav.runs.evaluate import evaluate
 from jaxnav.runs.policies import EVIDENCE_GAPS
 
-NUM_SCENES, EPISODES_PER_SCENE, NUM_RUNS = 6, 4, 3
+NUM_SCENES = 6
+EPISODES_PER_SCENE = 4
+NUM_RUNS = 3
+#: Shift of each episode: 0 for the first, 1 for the second.
 SHIFT = np.repeat([0, 1], NUM_SCENES * EPISODES_PER_SCENE)
 METRICS = ("sr", "spl", "sr@20", "sr@50")
 
@@ -74,21 +77,22 @@ def make_outcome(success: tuple[float, float], weight: float = 0.0) -> EpisodeOu
 
 
 POPULATION = PopulationMetrics(population_episodes(), SHIFT, (15, 30))
-#: Without experience half of the goals are found. With it three of four where the layout holds, and else one of four.
+#: Layout-blind agents reach half of the goals at either shift.
 LAYOUT_BLIND_OUTCOME = make_outcome((0.5, 0.5))
-AGENT = make_outcome((0.75, 0.25))
-#: Hard removal makes the agent as good as a layout-blind one.
-HARD = make_outcome((0.5, 0.5), weight=1.0)
+#: With experience, the agent reaches three of four goals at the first shift and one of four at the second.
+AGENT_OUTCOME = make_outcome((0.75, 0.25))
+#: Hard removal makes the agent as good as a layout-blind agent.
+HARD_OUTCOME = make_outcome((0.5, 0.5), weight=1.0)
 
 
-def means_of(intervals: tuple[Interval, ...]) -> list[float]:
+def list_means(intervals: tuple[Interval, ...]) -> list[float]:
     return [interval.mean for interval in intervals]
 
 
 def test_population_metrics_are_means_at_each_shift():
-    means = POPULATION.means(POPULATION.percent_metrics(AGENT))
-    # All take 20 actions where 10 do: SPL is half of SR, and none succeeds within 15.
-    assert {name: means_of(intervals) for name, intervals in means.items()} == {
+    means = POPULATION.means(POPULATION.percent_metrics(AGENT_OUTCOME))
+    # Episodes take 20 actions instead of 10: SPL is half of SR, and none succeeds within 15 actions.
+    assert {name: list_means(intervals) for name, intervals in means.items()} == {
         "sr": [75.0, 25.0],
         "spl": [37.5, 12.5],
         "sr@15": [0.0, 0.0],
@@ -97,26 +101,31 @@ def test_population_metrics_are_means_at_each_shift():
 
 
 def test_value_and_cost_are_differences_to_the_layout_blind_agent():
-    layout_blind, agent = POPULATION.percent_metrics(LAYOUT_BLIND_OUTCOME), POPULATION.percent_metrics(AGENT)
-    assert means_of(POPULATION.differences(layout_blind, agent, same_runs=False)["sr"]) == [25.0, -25.0]
+    layout_blind = POPULATION.percent_metrics(LAYOUT_BLIND_OUTCOME)
+    agent = POPULATION.percent_metrics(AGENT_OUTCOME)
+    assert list_means(POPULATION.differences(layout_blind, agent, same_runs=False)["sr"]) == [25.0, -25.0]
 
 
 def test_overall_differences_weigh_both_shifts():
-    agent, hard = POPULATION.percent_metrics(AGENT), POPULATION.percent_metrics(HARD)
-    assert means_of(POPULATION.differences(agent, hard, same_runs=True)["sr"]) == [-25.0, 25.0]
+    agent = POPULATION.percent_metrics(AGENT_OUTCOME)
+    hard = POPULATION.percent_metrics(HARD_OUTCOME)
+    assert list_means(POPULATION.differences(agent, hard, same_runs=True)["sr"]) == [-25.0, 25.0]
     assert POPULATION.overall_differences(agent, hard)["sr"].mean == 0.0
 
 
 def test_oracle_keeps_the_value_and_recovers_the_cost():
-    oracle = POPULATION.oracle_removal(AGENT, HARD)
-    assert POPULATION.removal_weights(oracle) == (0.0, 1.0)
-    layout_blind, agent, removed = (
-        POPULATION.percent_metrics(outcome) for outcome in (LAYOUT_BLIND_OUTCOME, AGENT, oracle)
-    )
-    # Of the value all is left, of the cost nothing. All scenes are alike, so that the leads are clear of 0.
-    assert means_of(POPULATION.remaining_shares(layout_blind, agent, removed, same_runs=False)["sr"]) == [100.0, 0.0]
-    # Nothing at the first shift, 25 points at the second.
-    assert POPULATION.overall_differences(agent, removed)["sr"].mean == 12.5
+    oracle_outcome = POPULATION.oracle_removal(AGENT_OUTCOME, HARD_OUTCOME)
+    assert POPULATION.removal_weights(oracle_outcome) == (0.0, 1.0)
+    layout_blind = POPULATION.percent_metrics(LAYOUT_BLIND_OUTCOME)
+    agent = POPULATION.percent_metrics(AGENT_OUTCOME)
+    oracle = POPULATION.percent_metrics(oracle_outcome)
+
+    # The oracle leaves 100 % of the value and 0 % of the cost. All scenes are alike, so the intervals of the leads
+    # exclude 0.
+    assert list_means(POPULATION.remaining_shares(layout_blind, agent, oracle, same_runs=False)["sr"]) == [100.0, 0.0]
+
+    # The change is 0 points at the first shift and 25 at the second.
+    assert POPULATION.overall_differences(agent, oracle)["sr"].mean == 12.5
 
 
 # Clocks and populations
@@ -124,7 +133,7 @@ def test_oracle_keeps_the_value_and_recovers_the_cost():
 
 def test_clocks_remove_at_shares_of_the_budget():
     trials = list_fixed_trials("sample", 150)
-    # 0.1, 0.25 and 0.5 of 150 actions, rounded.
+    # Clocks begin or end after 0.1, 0.25 and 0.5 of 150 actions, rounded.
     assert list(trials) == [
         *("constant 0.25", "constant 0.5", "constant 0.75"),
         *("after step 15", "after step 38", "after step 75"),
@@ -154,16 +163,17 @@ def test_removals_are_selected_by_pattern():
 
 def test_joined_lists_number_the_poses_and_scenes_of_all_banks():
     joined = join_end_to_end([population_episodes(3), population_episodes(4)], [100, 200])
-    # The poses of the second bank follow the 100 of the first.
+    # The second bank's poses follow the 100 poses of the first.
     assert sorted(set(joined.pose.tolist())) == [3, 104]
     assert joined.scene.max() == 4 * NUM_SCENES - 1
-    # A floor plan is one cluster, at whatever shift: six of them, and so five degrees of freedom.
+
+    # A floor plan is one cluster at all shifts: six clusters have five degrees of freedom.
     second_list = joined.take(joined.pose == 104)
     assert len(second_list.goal) == len(SHIFT)
     assert joined.clusters().degrees_of_freedom == second_list.clusters().degrees_of_freedom == NUM_SCENES - 1
 
 
-# Measurements. The run's own baseline stands in for layout-blind agents.
+# Measurements, in which the baseline of the run stands in for layout-blind agents
 
 
 @pytest.fixture
@@ -174,17 +184,18 @@ def bench(make_bench, drawn_run):
 
 @pytest.mark.exhaustive
 def test_mixture_measures_every_removal_at_both_shifts(bench):
-    rules = (REMOVAL_RULES[0], REMOVAL_RULES[-1])  # each estimator compiles again
-    # The run has no evidence of sightings, so rules of the gap `surprise` are left out.
+    # Only two rules are measured, because each estimator compiles again. The run has no evidence of sightings, so the
+    # table has no rules of the gap `surprise`.
+    rules = (REMOVAL_RULES[0], REMOVAL_RULES[-1])
     surprise_rules = [rule for rule in REMOVAL_RULES if rule.gap == "surprise"]
     assert surprise_rules
-    tried_rules = (*surprise_rules, *rules)
-    table = ResultTable(measure_removals(bench, bench.find_run("rooms", "main"), "sample", "own", tried_rules))
+    requested_rules = (*surprise_rules, *rules)
+    table = ResultTable(measure_removals(bench, bench.find_run("rooms", "main"), "sample", "own", requested_rules))
     row_fields = {"world": "rooms", "run": "main", "decoding": "sample"}
     assert {(row.world, row.run, row.decoding) for row in table.rows} == {("rooms", "main", "sample")}
     assert {row.scenes for row in table.rows} == {4}
 
-    # TDE and the oracle, then nine clocks, three controls of TDE, and the rules.
+    # The removals are TDE and the oracle, nine clocks, three controls of TDE, and the rules.
     removals = table.distinct("variant", row_fields, reference=WITHOUT_REMOVAL)
     assert removals[:2] == ["TDE", ORACLE_NAME]
     assert removals[-2:] == [str(rule) for rule in rules]
@@ -195,10 +206,10 @@ def test_mixture_measures_every_removal_at_both_shifts(bench):
     for shift, weight in ((0.0, 0.0), (1.0, 1.0)):
         assert table.find(row_fields, variant="TDE", shift=shift, metric="weight").mean == 1.0
         assert table.find(row_fields, variant=ORACLE_NAME, shift=shift, metric="weight").mean == weight
-    change = {"reference": WITHOUT_REMOVAL, "metric": "sr"}
-    assert table.find(row_fields, change, variant=ORACLE_NAME, shift=0.0).mean == 0.0
-    last_change = table.find(row_fields, change, variant="TDE", shift=1.0)
-    assert table.find(row_fields, change, variant=ORACLE_NAME, shift=1.0) == last_change
+    change_fields = {"reference": WITHOUT_REMOVAL, "metric": "sr"}
+    assert table.find(row_fields, change_fields, variant=ORACLE_NAME, shift=0.0).mean == 0.0
+    last_change = table.find(row_fields, change_fields, variant="TDE", shift=1.0)
+    assert table.find(row_fields, change_fields, variant=ORACLE_NAME, shift=1.0) == last_change
 
     # Values, leads and changes add up, and the mixture weighs both shifts alike.
     for metric in METRICS:
@@ -209,27 +220,25 @@ def test_mixture_measures_every_removal_at_both_shifts(bench):
             lead = table.find(row_fields, variant=WITHOUT_REMOVAL, reference=LAYOUT_BLIND, shift=shift, metric=metric)
             assert lead.mean == pytest.approx(values[WITHOUT_REMOVAL] - values[LAYOUT_BLIND])
         for removal in removals:
-            changes = []
-            for shift in (0.0, 1.0):
-                changes.append(
-                    table.find(row_fields, variant=removal, reference=WITHOUT_REMOVAL, shift=shift, metric=metric).mean
-                )
-            overall = table.find(row_fields, variant=removal, reference=WITHOUT_REMOVAL, metric=metric).mean
-            assert overall == pytest.approx(sum(changes) / 2)
+            removal_fields = row_fields | {"variant": removal, "reference": WITHOUT_REMOVAL, "metric": metric}
+            changes = [table.find(removal_fields, shift=shift).mean for shift in (0.0, 1.0)]
+            assert table.find(removal_fields).mean == pytest.approx(sum(changes) / 2)
 
-    # Every rule is compared with the gap of another episode, the mean gap unless it is a switch, and one clock.
-    for rule, own_controls in zip(rules, (["shuffled", "course"], ["shuffled"]), strict=True):
+    # Every rule is compared with the gap of another episode, with the mean gap unless the rule is a switch, and with a
+    # clock. Gaps by evidence also have a permuted control.
+    for rule, rule_controls in zip(rules, (["shuffled", "course"], ["shuffled"]), strict=True):
         controls = table.distinct("control", row_fields, variant=str(rule), reference="control")
-        assert controls[:-1] == own_controls + [PERMUTED_CONTROL] * (rule.gap in EVIDENCE_GAPS)
+        assert controls[:-1] == rule_controls + [PERMUTED_CONTROL] * (rule.gap in EVIDENCE_GAPS)
         assert controls[-1] in removals[2:-5]
 
 
 @pytest.mark.exhaustive
 def test_handover_leaves_the_layout_blind_agents(bench):
     table = ResultTable(measure_removals(bench, bench.find_run("rooms", "main"), "argmax", "layout-blind", ()))
-    (name,) = table.distinct("run")
-    row_fields = {"world": "rooms", "run": name, "decoding": "argmax"}
-    # An agent that hands over at once is worth as much as the layout-blind agents.
+    (run_name,) = table.distinct("run")
+    row_fields = {"world": "rooms", "run": run_name, "decoding": "argmax"}
+
+    # An agent that hands over at once has the metrics of the layout-blind agents.
     for metric in METRICS:
         for shift in (0.0, 1.0):
             agent = table.find(row_fields, variant=WITHOUT_REMOVAL, shift=shift, metric=metric)
@@ -240,34 +249,36 @@ def test_handover_leaves_the_layout_blind_agents(bench):
 
 @pytest.mark.exhaustive
 def test_folds_of_a_dataset_count_as_one_world(make_bench, drawn_run):
-    # Two folds share 16 episodes, so every mean over the dataset is that of the folds with eight episodes each.
+    # Two folds share 16 episodes, so every mean over the dataset is the mean of two folds with eight episodes each.
     run = {"run": str(drawn_run.config.run_dir)}
     folds = {"first": {"worlds": {"seed": 1}}, "second": {"worlds": {"seed": 2}}}
     settings = {"worlds": folds, "agents": {"main": run, "anonymous": run}, "shifts": (0.0, 1.0), "removals": ()}
     fold_tables = []
     for fold in folds:
         fold_bench = make_bench(**settings, episodes=8)
-        fold_tables.append(
-            ResultTable(measure_removals(fold_bench, fold_bench.find_run(fold, "main"), "argmax", "layout-blind", ()))
-        )
+        fold_run = fold_bench.find_run(fold, "main")
+        fold_tables.append(ResultTable(measure_removals(fold_bench, fold_run, "argmax", "layout-blind", ())))
 
-    dataset_bench = make_bench(**settings, episodes=16, folds={"both": list(folds)})
+    # The dataset joins the folds into one world.
+    dataset_bench = make_bench(**settings, episodes=16, folds={"dataset": list(folds)})
     (dataset_run,) = join_folds(dataset_bench.config, [dataset_bench.find_run("first", "main")])
     assert [fold.world for fold in dataset_run.folds] == list(folds)
     table = ResultTable(measure_removals(dataset_bench, dataset_run, "argmax", "layout-blind", ()))
     assert table.num_scenes(variant=WITHOUT_REMOVAL) == 2 * fold_tables[0].num_scenes(variant=WITHOUT_REMOVAL)
+
+    # Every mean of the dataset is compared with the folds.
+    field_names = ("run", "variant", "decoding", "shift", "reference", "metric")
     num_compared = 0
     for row in table.rows:
         if row.metric in METRICS and row.variant != ORACLE_NAME:
-            fields = {
-                name: getattr(row, name) for name in ("run", "variant", "decoding", "shift", "reference", "metric")
-            }
+            fields = {name: getattr(row, name) for name in field_names}
             fold_means = []
             for fold, fold_table in zip(folds, fold_tables, strict=True):
                 fold_means.append(fold_table.find(fields, world=fold).mean)
-            assert row.world == "both"
+            assert row.world == "dataset"
             assert row.value.mean == pytest.approx(sum(fold_means) / 2)
             num_compared += 1
+
     # Two agents, their lead and the change by removal at two shifts, and the change over the mixture.
     assert num_compared == len(METRICS) * (4 * 2 + 1)
 
@@ -279,7 +290,7 @@ def test_interrupted_mixtures_keep_finished_outcomes(make_bench, drawn_run, tmp_
     calls = []
     run_trials = TrialRunner.run_trials
 
-    def count_calls(runner, *arguments):
+    def interrupt_second_call(runner, *arguments):
         calls.append(arguments)
         if len(calls) == 2:
             raise KeyboardInterrupt
@@ -288,23 +299,22 @@ def test_interrupted_mixtures_keep_finished_outcomes(make_bench, drawn_run, tmp_
     def measure(folder):
         bench = make_bench(**settings)
         bench.unfinished_folder = folder
-        return [
-            row.to_json()
-            for row in measure_removals(bench, bench.find_run("rooms", "main"), "argmax", "layout-blind", ())
-        ]
+        rows = measure_removals(bench, bench.find_run("rooms", "main"), "argmax", "layout-blind", ())
+        return [row.to_json() for row in rows]
 
+    # The trials of the agent are interrupted after those of the layout-blind agents.
     expected_rows = measure(None)
-    monkeypatch.setattr(TrialRunner, "run_trials", count_calls)
+    monkeypatch.setattr(TrialRunner, "run_trials", interrupt_second_call)
     with pytest.raises(KeyboardInterrupt):
         measure(tmp_path)
 
-    # The layout-blind agents are not run again, and nothing is run the third time.
+    # The second measurement does not run the layout-blind agents again, and the third runs nothing.
     assert measure(tmp_path) == expected_rows
     assert len(calls) == 3
     assert measure(tmp_path) == expected_rows
     assert len(calls) == 3
 
-    # What is damaged is measured again.
+    # Damaged outcomes are measured again.
     cut_path, changed_path = tmp_path.iterdir()
     cut_path.write_bytes(cut_path.read_bytes()[:50])
     content = bytearray(changed_path.read_bytes())
@@ -332,16 +342,17 @@ def test_cde_leaves_the_network_without_experience(make_bench, drawn_run, tmp_pa
     for shift in (0.0, 1.0):
         assert table.find(row_fields, variant="CDE", shift=shift, metric="weight").mean == 1.0
 
-    # The same numbers as in the evaluation of the run.
+    # The changes equal those of an evaluation of the run.
     results = evaluate(run["run"], episodes=8, epsilon=0.5, removal="cde", shift=0.0)
     metrics = results.metrics()
-    rows = {(row.variant, row.decoding): index for index, row in enumerate(results.rows)}
+    row_indices = {(row.variant, row.decoding): index for index, row in enumerate(results.rows)}
     for metric in ("sr", "spl"):
         change = table.find(row_fields, variant="CDE", reference=WITHOUT_REMOVAL, shift=0.0, metric=metric)
-        removed, plain = (metrics[metric][rows[variant, "argmax"]].mean() for variant in ("cde", "layout"))
-        assert change.mean == pytest.approx(100 * (removed - plain), abs=1e-6)
+        cde_mean = metrics[metric][row_indices["cde", "argmax"]].mean()
+        layout_mean = metrics[metric][row_indices["layout", "argmax"]].mean()
+        assert change.mean == pytest.approx(100 * (cde_mean - layout_mean), abs=1e-6)
 
-    # A mixture of the own counterfactual memory shows the factual one beside it.
+    # A mixture with the counterfactual memory of the run also has removal with the factual memory.
     table = ResultTable(measure_removals(bench, bench.find_run("rooms", "main"), "argmax", "own", ()))
     assert "TDE, factual memory" in table.distinct("variant", reference=WITHOUT_REMOVAL)
 

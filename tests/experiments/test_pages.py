@@ -1,4 +1,4 @@
-"""Pages: verdicts, lines of tables, kept summaries, templates of one's own, and what packaged templates claim."""
+"""Pages: verdicts, lines of tables, preserved summaries, custom templates, and the claims of packaged templates."""
 
 import math
 import re
@@ -48,15 +48,15 @@ def render(folder: Path, template: str, *rows: ResultRow, config: ExperimentConf
     return render_page(folder / "page.md", template, config, {"val": ResultTable(rows)}, [])
 
 
-def render_own(folder: Path, body: str, *rows: ResultRow) -> str:
-    """Text of a page by a template of one's own, `own.md`; the body begins in its second line."""
-    template = folder / "own.md"
+def render_custom(folder: Path, body: str, *rows: ResultRow) -> str:
+    """Text of a page by a custom template, `custom.md`; the body begins in its second line."""
+    template = folder / "custom.md"
     template.write_text("{{ summary }}\n" + body)
     return render(folder, str(template), *rows)
 
 
 def read_lines(text: str) -> dict[str, list[str]]:
-    """Cells of all Markdown tables by the first cell of their line; of equal lines the first counts."""
+    """Cells of all Markdown tables by the first cell of their line; the first of equal names counts."""
     cells_by_name: dict[str, list[str]] = {}
     for line in text.splitlines():
         if line.startswith("|"):
@@ -73,13 +73,13 @@ def read_lines(text: str) -> dict[str, list[str]]:
     [
         (0.5, 3.0, "holds"),
         (2.5, 3.0, "holds"),
-        (0.5, 1.5, "excluded"),  # whatever its sign
+        (0.5, 1.5, "excluded"),  # positive, but too small
         (-1.0, 1.5, "excluded"),
         (-4.0, -1.0, "refuted"),
         (-4.0, 0.0, "excluded"),  # 0 is within the interval
         (-1.0, 2.5, "inconclusive"),
         (0.0, 2.5, "inconclusive"),
-        (-1.0, 2.0, "inconclusive"),  # what would matter is within the interval, too
+        (-1.0, 2.0, "inconclusive"),  # the least effect is within the interval, too
         (math.nan, math.nan, "inconclusive"),
     ],
 )
@@ -87,14 +87,16 @@ def test_a_verdict_compares_the_interval_with_zero_and_the_least_effect(low, hig
     assert verdict(Interval(5.0, low, high), min_effect=2.0) == expected
 
 
-def test_without_an_effect_the_verdict_says_so():
-    undefined = verdict(Interval(math.nan), min_effect=2.0)
-    assert undefined not in ("holds", "refuted", "excluded")
+def test_an_undefined_effect_has_no_decisive_verdict():
+    undefined_verdict = verdict(Interval(math.nan), min_effect=2.0)
+    assert undefined_verdict not in ("holds", "refuted", "excluded")
 
 
 def test_undefined_values_are_dashes():
-    undefined = Interval(math.nan)
-    assert format_value(undefined, "+.1f") == format_value(math.nan, ".1f") == format_with_std(undefined) == "-"
+    undefined_value = Interval(math.nan)
+    assert format_value(undefined_value, "+.1f") == "-"
+    assert format_value(math.nan, ".1f") == "-"
+    assert format_with_std(undefined_value) == "-"
     assert effect_cells(ResultTable([]), {"world": "rooms"}, [0.0]) == ["- (-)"]
     assert format_weights(ResultTable([]), {"world": "rooms"}, [0.0, 1.0]) == "-, -"
 
@@ -109,9 +111,9 @@ def test_values_show_their_interval_or_their_deviation():
 
 def test_lines_have_a_cell_for_each_column():
     assert table_line("a", ["b", 2], ("c",), 3.5) == "| a | b | 2 | c | 3.5 |"
-    title_line, rule = table_header("", ["SR", "SPL"], "DTS").splitlines()
-    assert title_line.count("|") == rule.count("|") == 5
-    assert rule.split("|")[1:-1] == [" --- ", " ---: ", " ---: ", " ---: "]
+    title_line, rule_line = table_header("", ["SR", "SPL"], "DTS").splitlines()
+    assert title_line.count("|") == rule_line.count("|") == 5
+    assert rule_line.split("|")[1:-1] == [" --- ", " ---: ", " ---: ", " ---: "]
 
 
 def test_a_difference_of_worlds_adds_both_widths():
@@ -124,7 +126,7 @@ def test_a_difference_of_worlds_adds_both_widths():
 
 
 @pytest.mark.parametrize("content", ["", "My own notes.\n", f"{READING_MARK}\nOne mark of two.\n"])
-def test_a_document_that_is_no_page_is_not_written_over(tmp_path, content):
+def test_a_document_that_is_no_page_is_not_overwritten(tmp_path, content):
     document = tmp_path / "page.md"
     document.write_text(content)
     with pytest.raises(InputError, match=r"page\.md"):
@@ -136,25 +138,25 @@ def test_a_document_that_is_no_page_is_not_written_over(tmp_path, content):
 
 def test_a_page_keeps_its_summary(tmp_path):
     body = "SR: {{ table.find(world='rooms', run='main', metric='sr') | f('.1f') }}\n"
-    render_own(tmp_path, body, make_row(50.0))
+    render_custom(tmp_path, body, make_row(50.0))
     document = tmp_path / "page.md"
     head, _, tail = document.read_text().split(READING_MARK)
 
-    # What stands between the marks is text, even if it looks like a template.
+    # Text between the marks is copied, even if it looks like a template.
     summary = "\nAs found:\n\n* | a table |\n* {{ table }} {% if %}\n"
     document.write_text(head + READING_MARK + summary + READING_MARK + tail)
-    render_own(tmp_path, body, make_row(12.5))
+    render_custom(tmp_path, body, make_row(12.5))
     assert document.read_text().split(READING_MARK)[1] == summary
     assert "SR: 12.5 [-]" in document.read_text()
 
-    # The same results give the same document.
+    # Equal results give an equal document.
     content = document.read_bytes()
-    render_own(tmp_path, body, make_row(12.5))
+    render_custom(tmp_path, body, make_row(12.5))
     assert document.read_bytes() == content
 
 
 def test_a_page_is_written_into_a_new_folder(tmp_path):
-    template = tmp_path / "own.md"
+    template = tmp_path / "custom.md"
     template.write_text("# {{ config.title }}\n{{ summary }}")
     document = tmp_path / "new" / "docs" / "page.md"
     text = render_page(document, str(template), CONFIG, {}, [])
@@ -162,10 +164,10 @@ def test_a_page_is_written_into_a_new_folder(tmp_path):
     assert text.startswith("# A title")
 
 
-# Templates of one's own
+# Custom templates
 
 
-def test_a_template_of_ones_own_knows_the_experiment_and_its_results(tmp_path):
+def test_a_custom_template_has_the_experiment_and_its_results(tmp_path):
     body = """{% import "macros.md" as m %}
 {{ header("agent", shift_titles(config.shifts)) }}
 {% for world, agents in runs.items() %}
@@ -178,26 +180,25 @@ def test_a_template_of_ones_own_knows_the_experiment_and_its_results(tmp_path):
 {% endfor %}
 {% endfor %}
 """
-    # Agents without results are left out.
-    text = render_own(tmp_path, body, make_row(make_interval(50.0), shift=0.0), make_row(40.0, shift=1.0))
+    # The table has no line for agents without results.
+    text = render_custom(tmp_path, body, make_row(make_interval(50.0), shift=0.0), make_row(40.0, shift=1.0))
     cells = read_lines(text)
     assert cells["agent"] == ["shift 0", "shift 1"]
     assert cells["`main`"] == ["50.0 [49.0, 51.0]", "40.0 [-]"]
     assert "`anonymous`" not in cells
 
 
-def test_a_template_may_include_templates_beside_it(tmp_path):
+def test_a_template_may_include_templates_of_its_folder(tmp_path):
     (tmp_path / "part.md").write_text("An included {{ config.title }}.")
-    assert "An included A title." in render_own(tmp_path, '{% include "part.md" %}')
+    assert "An included A title." in render_custom(tmp_path, '{% include "part.md" %}')
 
 
 def test_a_template_may_draw_figures(tmp_path):
     steps = np.array([0.0, 1.0])
-    rows = [
-        make_row(Curve(steps, steps, steps, steps), variant="paper", shift=1.0, control="updated", metric="gap auc")
-    ]
+    curve = Curve(steps, steps, steps, steps)
+    row = make_row(curve, variant="paper", shift=1.0, control="updated", metric="gap auc")
     fields = '{"world": "rooms", "run": "main"}'
-    text = render_own(tmp_path, f'![AUC]({{{{ figure("auc", table, config.shifts, {fields}) }}}})', *rows)
+    text = render_custom(tmp_path, f'![AUC]({{{{ figure("auc", table, config.shifts, {fields}) }}}})', row)
     (image,) = re.findall(r"!\[AUC\]\((.*)\)", text)
     assert (tmp_path / image).read_bytes().startswith(b"\x89PNG")
 
@@ -220,8 +221,8 @@ def test_a_template_may_draw_figures(tmp_path):
     ],
 )
 def test_a_fault_in_a_template_is_one_error_with_file_and_line(tmp_path, line):
-    with pytest.raises(InputError, match=r"own\.md, line 4") as refusal:
-        render_own(tmp_path, f"A line.\n\n{line}\n", make_row())
+    with pytest.raises(InputError, match=r"custom\.md, line 4") as refusal:
+        render_custom(tmp_path, f"A line.\n\n{line}\n", make_row())
     assert "\n" not in str(refusal.value)
     assert not (tmp_path / "page.md").exists()
 
@@ -230,10 +231,10 @@ def test_a_fault_in_a_template_is_one_error_with_file_and_line(tmp_path, line):
 def test_a_fault_in_an_included_template_names_its_file(tmp_path, line):
     (tmp_path / "part.md").write_text(f"A line.\n{line}\n")
     with pytest.raises(InputError, match=r"part\.md, line 2"):
-        render_own(tmp_path, '{% include "part.md" %}')
+        render_custom(tmp_path, '{% include "part.md" %}')
 
 
-def test_a_template_that_is_no_template_is_refused(tmp_path):
+def test_unknown_binary_and_bare_templates_are_refused(tmp_path):
     # The message lists the packaged ones.
     with pytest.raises(InputError, match=r"unknown.*factors.*study"):
         check_page(tmp_path / "page.md", "unknown")
@@ -241,7 +242,7 @@ def test_a_template_that_is_no_template_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"binary\.md"):
         check_page(tmp_path / "page.md", str(tmp_path / "binary.md"))
 
-    # Without its summary, a page could not be written again.
+    # A template needs the summary, because a page without one could not be written again.
     (tmp_path / "bare.md").write_text("No summary.\n")
     with pytest.raises(InputError, match=r"bare\.md.*summary"):
         render(tmp_path, str(tmp_path / "bare.md"))
@@ -256,14 +257,14 @@ ZERO_STDE = {"variant": "stde", "decoding": "argmax", "epsilon": 0.0, "form": "p
 
 
 def make_course(start: float, at_step_20: float) -> Curve:
-    """Line from step 0 through step 20 with bounds 0.01 away."""
+    """Line through its values at steps 0 and 20, with bounds at a distance of 0.01."""
     steps = np.arange(NUM_STEPS, dtype=float)
     mean = start + (at_step_20 - start) * steps / 20
     return Curve(steps, mean, mean - 0.01, mean + 0.01)
 
 
 def study_rows() -> list[ResultRow]:
-    """Results whose effects differ, each with bounds 1 point away."""
+    """Results of all claims of the study: the effects differ, and most bounds are at a distance of 1 point."""
     to_layout = {"reference": "layout", "shift": 1.0}
     rows = [
         make_row(make_interval(9.0), shift=1.0, reference="first shift", metric="baseline_argmax_sr"),
@@ -286,9 +287,9 @@ def study_rows() -> list[ResultRow]:
             rows.append(make_row(curve, variant="calibrated", control=belief, shift=shift, metric="gap"))
     for setting, curve in aucs.items():
         rows.append(make_row(curve, variant=setting, control="updated", shift=1.0, metric="gap auc"))
-    undefined = np.full(NUM_STEPS, math.nan)
+    no_bounds = np.full(NUM_STEPS, math.nan)
     running_share = 100 - 100 * np.arange(NUM_STEPS) / NUM_STEPS
-    running = Curve(np.arange(NUM_STEPS, dtype=float), running_share, undefined, undefined)
+    running = Curve(np.arange(NUM_STEPS, dtype=float), running_share, no_bounds, no_bounds)
     rows.append(make_row(running, shift=0.0, metric="running"))
 
     # Experience is worth 8 points as trained and costs 7 if shifted, of which removal recovers 3.
@@ -313,7 +314,7 @@ CLAIMS = [
     ("sTDE (paper's form, epsilon 0) improves", 5.0, 1.0, "holds"),
     ("sTDE with the `evidence` gap", 4.0, 1.0, "holds"),
     ("grows with the shift", 2.0, 0.5, "holds"),
-    ("Hard TDE loses", 6.0, 1.0, "holds"),  # the effect is -6: losing is what is claimed
+    ("Hard TDE loses", 6.0, 1.0, "holds"),  # the effect is -6, and the claim is a loss
     ("Success rises", 0.3, 0.1, "holds"),
     ("where the similarity is low", 2.5, 0.25, "holds"),  # -2.5 points per 0.1 more similarity
     ("gap is below 0.5", 0.3, 0.01, "holds"),  # 0.5 - 0.2
@@ -340,15 +341,17 @@ def study_page(tmp_path_factory) -> str:
 
 
 @pytest.mark.parametrize(("words", "mean", "half_width", "expected"), CLAIMS)
-def test_a_claim_has_the_sign_of_what_it_claims(study_page, words, mean, half_width, expected):
+def test_the_effect_of_a_claim_has_the_claimed_sign(study_page, words, mean, half_width, expected):
     effect, _, claim_verdict = find_claim(study_page, words)
-    low, high = mean - half_width, mean + half_width
     numbers = [float(number) for number in re.findall(r"[-+]?[0-9.]+", effect)]
-    assert numbers == pytest.approx([mean, low, high], abs=0.051 if mean >= 1 else 0.0051)
+
+    # Points of success have one decimal on the page, correlations, gaps and AUCs have two.
+    tolerance = 0.051 if mean >= 1 else 0.0051
+    assert numbers == pytest.approx([mean, mean - half_width, mean + half_width], abs=tolerance)
     assert claim_verdict == expected
 
 
-def test_the_study_claims_nothing_else(study_page):
+def test_the_study_has_no_further_claims(study_page):
     claims = study_page.split("### Claims")[1].split("###")[0]
     assert len(read_lines(claims)) == len(CLAIMS) + 2  # header and rule
 
@@ -379,10 +382,11 @@ def test_epsilon_is_chosen_on_val_and_applied_on_test(tmp_path):
             rows.append(make_row(sr, **{**PAPER_STDE, "epsilon": epsilon}, gap="novelty", shift=0.0))
         tables[split] = ResultTable(rows)
     text = render_page(tmp_path / "page.md", "study", CONFIG, tables, [])
-    chosen_lines = [line for line in text.split("## Split `test`")[1].splitlines() if "chosen)" in line]
-    assert len(chosen_lines) == 2  # at both shifts
-    assert "0.75" in chosen_lines[0]
-    assert "40.0" in chosen_lines[0]
+    test_section = text.split("## Split `test`")[1]
+    epsilon_lines = [line for line in test_section.splitlines() if "chosen)" in line]
+    assert len(epsilon_lines) == 2  # at both shifts
+    assert "0.75" in epsilon_lines[0]
+    assert "40.0" in epsilon_lines[0]
 
 
 @pytest.mark.slow
@@ -412,7 +416,7 @@ def test_pages_compare_both_splits_and_judge_gains_on_test(tmp_path, template, s
     assert len(test_lines) == 1
     assert "refuted" in test_lines[0]
 
-    # Results of one split alone are those of the page, without the section.
+    # A page of one split has no such section.
     text = render_page(tmp_path / "page.md", template, config, {split: tables[split]}, [])
     assert "evaluated once" not in text
     assert f"of the split `{split}`" in text
@@ -422,7 +426,7 @@ def test_pages_compare_both_splits_and_judge_gains_on_test(tmp_path, template, s
 
 
 def mixture_rows(world: str) -> list[ResultRow]:
-    """Value 6 and cost -4 of experience, and two removals, in one world."""
+    """Results of one world, where experience has a value of 6 points and a cost of 4, and those of TDE."""
     sampled = {"world": world, "decoding": "sample"}
     rows = []
     for shift, lead in ((0.0, 6.0), (1.0, -4.0)):
@@ -434,7 +438,7 @@ def mixture_rows(world: str) -> list[ResultRow]:
             rows.append(make_row(lead, **fields, **lead_fields))
         rows.append(make_row(20.0, **sampled, shift=shift, variant="without removal", metric="length"))
 
-        # TDE keeps a third of the value, and leaves a quarter of the cost; in SPL no share can be told.
+        # TDE keeps a third of the value and leaves a quarter of the cost; SPL has no defined share.
         share = 33.0 if shift == 0.0 else 25.0
         rows.append(make_row(1.0, **sampled, shift=shift, variant="TDE", metric="weight"))
         for metric in ("sr", "spl", "sr@40"):
@@ -450,16 +454,16 @@ def test_removal_keeps_value_and_recovers_cost(tmp_path):
     value = read_lines(text.split("### Value and cost of experience")[1])["its value (or cost)"]
     assert value == ["+6.0 [-]"] * 3 + ["-4.0 [-]"] * 3
 
-    # One table per measure: weights, changes at both shifts and over the mixture, and shares where there are any.
-    text_of_removals = text.split("### Every removal")[1]
+    # Each metric has a table of weights, changes at the shifts and over the mixture, and shares if they are defined.
+    removal_section = text.split("### Every removal")[1]
     for title, shares in (("SR within 40 actions", ["33", "75"]), ("SR", ["33", "75"]), ("SPL", [])):
-        weights, *cells = read_lines(text_of_removals.split(f"**{title}**")[1])["TDE"]
+        weights, *cells = read_lines(removal_section.split(f"**{title}**")[1])["TDE"]
         assert weights == "1.00, 1.00"
-        assert cells[:3] == ["-4.0 [-]", "+3.0 [-]", "-"]  # there is no row over the mixture
+        assert cells[:3] == ["-4.0 [-]", "+3.0 [-]", "-"]  # the results have no row over the mixture
         assert [cell.split()[0] for cell in cells[3:]] == shares
 
 
-def test_a_world_may_be_measured_on_one_split_alone(tmp_path):
+def test_a_world_may_be_measured_on_a_single_split(tmp_path):
     config = ExperimentConfig(worlds={"rooms": {}, "apartments": {"world": "apartments"}}, agents={"main": {}})
     tables = {
         "val": ResultTable([*mixture_rows("rooms"), *mixture_rows("apartments")]),
@@ -494,7 +498,7 @@ def make_agent_rows(world: str, run: str, **sr: float) -> list[ResultRow]:
 
 
 def make_effect(world: str, run: str, variant: str, reference: str, effect: Interval, metric: str = "sr") -> ResultRow:
-    stde = {"epsilon": 0.5, "form": "residual"} if variant == "stde" and run not in ("hosts",) else {}
+    stde = {"epsilon": 0.5, "form": "residual"} if variant == "stde" and run != "hosts" else {}
     fields = {"variant": variant, "decoding": "argmax", "reference": reference, "shift": 0.0, **stde}
     return make_row(effect, world=world, run=run, metric=metric, **fields)
 
@@ -518,7 +522,7 @@ def test_orderings_are_judged_by_their_intervals(tmp_path):
     assert cells["rooms: structured methods over `rgb` (2 of 6)"] == ["+9.4", "+20.0 [+19.0, +21.0]", "-", "holds"]
     assert cells["rooms: methods over Random (3 of 8)"] == ["+60.6", "+68.0 [+67.0, +69.0]", "-", "holds"]
 
-    # Hosts: what the paper's Table 1 says of ORG, 71.40 - 66.48, its Table 2, 74.85 - 66.53, and 71.40 - 69.24.
+    # Gains of ORG in the paper: 71.40 - 66.48 in Table 1, 74.85 - 66.53 in Table 2, and 71.40 - 69.24.
     assert cells["rooms: `org` + w over `org`"] == ["+4.9", "+5.0 [+4.0, +6.0]", "-", "holds"]
     assert cells["rooms: `org` + w + sTDE over `org`"][1:] == ["+0.5 [-0.5, +1.5]", "-", "excluded"]
     assert cells["rooms: `org` + w over `org` + w + TDE"] == ["+2.2", "-5.0 [-6.0, -4.0]", "-", "refuted"]
@@ -526,13 +530,13 @@ def test_orderings_are_judged_by_their_intervals(tmp_path):
 
     # Effects on SPL have a column, too.
     changes = {"sr": -5.0, "spl": -3.0}
-    spl_rows = [
-        make_effect("rooms", "org", "tde", "layout", make_interval(mean), metric) for metric, mean in changes.items()
-    ]
+    spl_rows = []
+    for metric, mean in changes.items():
+        spl_rows.append(make_effect("rooms", "org", "tde", "layout", make_interval(mean), metric))
     spl_cells = read_lines(render_paper(tmp_path, *make_agent_rows("rooms", "org", baseline=80.0), *spl_rows))
     assert spl_cells["rooms: `org` + w over `org` + w + TDE"][2] == "+3.0 [+2.0, +4.0]"
 
-    # What has no results is not judged.
+    # Orderings without results have no verdict.
     assert cells["rooms: `eotp` + w over `eotp`"][1:] == ["-", "-", "not run"]
     assert cells["apartments: all"][-1] == cells["gains of hosts: apartments over rooms"][-1] == "not run"
 
@@ -545,7 +549,7 @@ def make_share(run: str, variant: str, share: float) -> ResultRow:
 
 def test_hosts_with_idle_experience_have_no_verdict(tmp_path):
     effects = [make_effect("rooms", run, "layout", "baseline", make_interval(5.0)) for run in ("org", "hoz")]
-    # The share of the arm with w counts.
+    # The share of the arm with w decides: ORG is just below 5 %, HOZ at 5 %.
     shares = [make_share("org", "baseline", 20.0), make_share("org", "layout", 4.9), make_share("hoz", "layout", 5.0)]
     cells = read_lines(render_paper(tmp_path, *effects, *shares))
     assert cells["rooms: `hoz` + w over `hoz`"][-2:] == ["5.0 [4.0, 6.0]", "holds"]
@@ -573,7 +577,8 @@ def test_methods_with_idle_experience_have_no_verdict(tmp_path):
     cells = read_lines(section)
     assert cells["`hoz`"][:2] == ["+10.0 [+9.0, +11.0]<br>**holds**", "+5.0 [+4.0, +6.0]<br>**holds**"]
     assert cells["`hoz`"][-1] == "12.0 [11.0, 13.0]"
-    # The lead over layout-blind agents is judged all the same.
+
+    # The lead over layout-blind agents has a verdict nevertheless.
     lead, effect_of_weights, *_ = cells["`org`"]
     assert lead == "+10.0 [+9.0, +11.0]<br>**holds**"
     assert effect_of_weights == '<span class="idle">+5.0 [+4.0, +6.0]</span>'
@@ -581,7 +586,7 @@ def test_methods_with_idle_experience_have_no_verdict(tmp_path):
 
 @pytest.mark.slow
 def test_claims_of_the_study_on_idle_experience_have_no_verdict(tmp_path):
-    # The share of the arm with w counts: 4 %. The loss of the baseline is a claim on neither w nor sTDE.
+    # The share of the arm with w decides: 4 %. The loss of the baseline is a claim about neither w nor sTDE.
     shares = [make_share("main", "baseline", 20.0), make_share("main", "layout", 4.0)]
     text = render(tmp_path, "study", *study_rows(), *shares)
     assert find_claim(text, "w improves the baseline at shift 1")[-1] == "experience is idle"
@@ -589,7 +594,7 @@ def test_claims_of_the_study_on_idle_experience_have_no_verdict(tmp_path):
     assert find_claim(text, "The baseline loses success")[-1] != "experience is idle"
     assert "decide 20.0 [19.0, 21.0] % of the decisions of the baseline and 4.0 [3.0, 5.0] %" in text
 
-    # With 12 % all claims are judged.
+    # With 12 % all claims have verdicts.
     text = render(tmp_path, "study", *study_rows(), shares[0], make_share("main", "layout", 12.0))
     assert "experience is idle" not in text
 
@@ -605,11 +610,11 @@ def test_agents_are_compared_with_an_agent_or_with_one_of_its_variants(tmp_path,
         make_effect("rooms", "hoz", "layout", row_reference, make_interval(10.0)),
     ]
     text = render(tmp_path, template, *rows, config=config)
-    lines = [line for line in text.splitlines() if line.startswith("| `hoz`") and "over `org`" in line]
-    assert any("+10.0 [+9.0, +11.0]" in line and "holds" in line for line in lines), text
+    comparisons = [line for line in text.splitlines() if line.startswith("| `hoz`") and "over `org`" in line]
+    assert any("+10.0 [+9.0, +11.0]" in line and "holds" in line for line in comparisons), text
 
 
-def test_cost_of_training_without_times_or_of_a_fit_has_no_nan(tmp_path):
+def test_training_costs_without_times_or_of_a_fit_have_no_nan(tmp_path):
     agents = {"org": {}, "belief": {"method": "belief"}}
     config = ExperimentConfig(agents=agents, shifts=(0.0,))
     rows = make_agent_rows("rooms", "org", baseline=50.0)
@@ -634,25 +639,30 @@ def test_agents_of_factors_have_their_decision_share(tmp_path):
         "gate+w": {"arms": ["layout"], "done_gate": True, "against": ["w/layout"]},
     }
     config = ExperimentConfig(agents=agents, shifts=(0.0,))
-    rows = [*make_agent_rows("rooms", "base", baseline=50.0)]
-    rows += [*make_agent_rows("rooms", "w", layout=60.0), *make_agent_rows("rooms", "gate+w", layout=70.0)]
-    rows.append(make_effect("rooms", "w", "layout", "base/baseline", make_interval(10.0)))
-    rows.append(make_effect("rooms", "gate+w", "layout", "w/layout", make_interval(10.0)))
+    rows = [
+        *make_agent_rows("rooms", "base", baseline=50.0),
+        *make_agent_rows("rooms", "w", layout=60.0),
+        *make_agent_rows("rooms", "gate+w", layout=70.0),
+        make_effect("rooms", "w", "layout", "base/baseline", make_interval(10.0)),
+        make_effect("rooms", "gate+w", "layout", "w/layout", make_interval(10.0)),
+    ]
     shares = [make_share("base", "baseline", 3.0), make_share("w", "layout", 8.0)]
     cells = read_lines(render(tmp_path, "factors", *rows, *shares, config=config))
     assert cells["`base`"][-1] == "3.0 [2.0, 4.0]"
     assert cells["`w`"][-1] == "8.0 [7.0, 9.0]"
     assert cells["`w` over `base`"][0] == "holds"
-    # Below 5 %, an effect of the layout alone has no verdict; that of another part has one.
+
+    # Below 5 %, an effect of nothing but the layout has no verdict; the effect of another part has one.
     idle_shares = [make_share(agent, agents[agent]["arms"][0], 4.0) for agent in agents]
     cells = read_lines(render(tmp_path, "factors", *rows, *idle_shares, config=config))
     assert "experience is idle" in cells["`w` over `base`"][0]
     assert cells["`gate+w` over `w`"][0] == "holds"
-    # Earlier results have no shares, and the table no column.
+
+    # Earlier results have no shares, and their table has no such column.
     assert len(read_lines(render(tmp_path, "factors", *rows, config=config))["`w`"]) == len(cells["`w`"]) - 1
 
 
-def test_gains_of_worlds_are_compared_by_both_intervals(tmp_path):
+def test_gains_of_worlds_are_compared_by_their_intervals(tmp_path):
     rows = [
         make_effect("apartments", "hosts", "stde", "baseline", make_interval(10.0)),
         make_effect("rooms", "hosts", "stde", "baseline", make_interval(5.0)),
@@ -660,21 +670,23 @@ def test_gains_of_worlds_are_compared_by_both_intervals(tmp_path):
     ]
     cells = read_lines(render_paper(tmp_path, *rows))
 
-    # Both widths add up to 2. The paper's hosts gain (8.53 + 9.63 + 9.91 + 9.86) / 4 = 9.4825 in RoboTHOR and
+    # The widths of 1 add up to 2. The paper's hosts gain (8.53 + 9.63 + 9.91 + 9.86) / 4 = 9.4825 in RoboTHOR and
     # (4.01 + 8.32 + 5.15 + 4.67) / 4 = 5.5375 in AI2-THOR, its SemExp 1.61.
     assert cells["gains of hosts: apartments over rooms"] == ["+3.9", "+5.0 [+3.0, +7.0]", "-", "holds"]
     assert cells["gains: hosts in rooms over `semexp` in houses"] == ["+3.9", "+5.0 [+3.0, +7.0]", "-", "holds"]
 
 
-def test_scenes_of_a_dataset_have_columns_beside_those_of_the_paper(tmp_path):
+def test_scenes_of_a_dataset_have_columns_next_to_those_of_the_paper(tmp_path):
     rows = [*make_agent_rows("rooms", "org", baseline=90.0), *make_agent_rows("ithor", "org", baseline=88.0)]
     effect = make_effect("ithor", "org", "layout", "baseline", make_interval(1.0, 3.0))
     text = render_paper(tmp_path, *rows, effect)
     cells = read_lines(text.split("### Table 2: AI2-THOR")[1].split("###")[0])
     assert cells["`org`"] == ["66.53", "39.00", "0.54", "90.0 [-]", "-", "-", "88.0 [-]", "-", "-"]
-    # The ordering is judged in these scenes, too, next to the gain of the paper's Table 1: 71.40 - 66.48.
+
+    # The ordering has a verdict in these scenes, too, next to the gain of the paper's Table 1: 71.40 - 66.48.
     assert read_lines(text)["ithor: `org` + w over `org`"] == ["+4.9", "+1.0 [-2.0, +4.0]", "-", "inconclusive"]
-    # Datasets that were not run have neither columns nor lines.
+
+    # Datasets without results have neither columns nor lines.
     assert len(read_lines(text.split("### Table 2: RoboTHOR")[1].split("###")[0])["`org`"]) == 6
     assert not any(name.startswith("robothor") for name in read_lines(text))
 

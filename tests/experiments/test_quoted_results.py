@@ -1,4 +1,4 @@
-"""Every interval that the texts quote is one of the stored results."""
+"""Every interval that the texts quote is a stored result."""
 
 import json
 import re
@@ -12,34 +12,36 @@ from jaxnav.experiments.pages import READING_MARK
 ROOT = Path(__file__).parents[2]
 #: A mean with its interval, such as `3.2 [1.4, 5.1]`, `81 [64, 97]`, `39.4 % [35.0, 43.8]` or `+0.1 [-1.5, +1.6]`.
 INTERVAL = re.compile(r"(?<![\w.])([-+]?[\d.]+)(?: ?%)?(?: points)? \[([-+]?[\d.]+), ([-+]?[\d.]+)\]")
-#: Texts whose numbers are results, beside the texts that people write on the pages of experiments.
+#: Texts that quote results, in addition to the summaries on the pages of experiments.
 SUMMARIES = ("README.md", "docs/results.md")
 
 Quote = tuple[int, float, float, float]
 
 
 def quoted_intervals(text: str) -> Iterator[Quote]:
-    """Number of decimals, mean and bounds of each interval in a text."""
+    """Yield the number of decimals, the mean and the bounds of each interval in a text."""
     for match in INTERVAL.finditer(" ".join(text.split())):
         digits = max(len(number.partition(".")[2]) for number in match.groups())
         mean, low, high = map(float, match.groups())
         yield digits, mean, low, high
 
 
-def with_either_sign(quote: Quote) -> tuple[Quote, Quote]:
-    """An effect of -4.6 [-7.9, -1.2] is a loss of 4.6 [1.2, 7.9]."""
+def both_signs(quote: Quote) -> tuple[Quote, Quote]:
+    """A quote as an effect and as a loss: an effect of -4.6 [-7.9, -1.2] is a loss of 4.6 [1.2, 7.9]."""
     digits, mean, low, high = quote
     return quote, (digits, -mean, -high, -low)
 
 
 def stored_intervals(value) -> Iterator[tuple[float, float, float]]:
-    """All intervals of a JSON value, those of curves included."""
+    """Yield all defined intervals of a JSON value, including those of curves."""
     if isinstance(value, dict):
         if {"mean", "low", "high"} <= value.keys():
             columns = [value["mean"], value["low"], value["high"]]
             if not isinstance(columns[0], list):
                 columns = [[column] for column in columns]
-            yield from (row for row in zip(*columns, strict=True) if None not in row)
+            for interval in zip(*columns, strict=True):
+                if None not in interval:
+                    yield interval
         for child in value.values():
             yield from stored_intervals(child)
     elif isinstance(value, list):
@@ -47,16 +49,23 @@ def stored_intervals(value) -> Iterator[tuple[float, float, float]]:
             yield from stored_intervals(child)
 
 
+def json_texts(path: Path) -> list[str]:
+    """JSON values of a file: its lines, or the file itself."""
+    text = path.read_text()
+    return text.splitlines() if path.suffix == ".jsonl" else [text]
+
+
 @pytest.fixture(scope="module")
 def known_quotes() -> set[Quote]:
-    """All that a text may quote: stored intervals, rounded, and the generated tables of pages."""
+    """All intervals that a text may quote: stored intervals, rounded, and the generated tables of pages."""
     quotes = set()
     for path in (ROOT / "results").rglob("*.json*"):
-        for line in path.read_text().splitlines() if path.suffix == ".jsonl" else [path.read_text()]:
-            for interval in stored_intervals(json.loads(line)):
+        for json_text in json_texts(path):
+            for mean, low, high in stored_intervals(json.loads(json_text)):
                 for digits in (0, 1, 2):
-                    mean, low, high = (round(number, digits) for number in interval)
-                    quotes.add((digits, mean, low, high))
+                    quotes.add((digits, round(mean, digits), round(low, digits), round(high, digits)))
+
+    # The tables of a page are outside the text between its marks.
     for path in (ROOT / "docs").glob("*.md"):
         if f"docs/{path.name}" in SUMMARIES:
             continue
@@ -68,7 +77,7 @@ def known_quotes() -> set[Quote]:
 
 
 def written_texts() -> dict[str, str]:
-    """What people wrote, by file; rows of `make run` are of no stored result."""
+    """Texts written by people, by file. Lines about `make run` are left out, because its results are not stored."""
     texts = {}
     for name in SUMMARIES:
         lines = (ROOT / name).read_text().splitlines()
@@ -83,15 +92,18 @@ def written_texts() -> dict[str, str]:
 @pytest.mark.parametrize("name", written_texts())
 def test_quoted_intervals_are_results(name, known_quotes):
     for quote in quoted_intervals(written_texts()[name]):
-        assert known_quotes.intersection(with_either_sign(quote)), quote
+        assert known_quotes.intersection(both_signs(quote)), quote
 
 
 def test_a_wrong_digit_is_noticed(known_quotes):
-    # Among so many results, a wrong number is sometimes another result.
-    quotes = [quote for text in written_texts().values() for quote in quoted_intervals(text)]
+    quotes = []
+    for text in written_texts().values():
+        quotes += quoted_intervals(text)
     assert len(quotes) > 300
+
+    # A wrong number is sometimes another one of the many results, so 90 % suffice.
     num_noticed = 0
     for digits, mean, low, high in quotes:
         wrong_quote = (digits, round(mean + 10.0**-digits, digits), low, high)
-        num_noticed += not known_quotes.intersection(with_either_sign(wrong_quote))
+        num_noticed += not known_quotes.intersection(both_signs(wrong_quote))
     assert num_noticed > 0.9 * len(quotes)

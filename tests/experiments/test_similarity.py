@@ -1,4 +1,4 @@
-"""Success and gain against layout similarity: worked scenes, SciPy, plain loops, and data without any relation."""
+"""Relations of success and gain to layout similarity, checked by hand, by SciPy, by plain loops and on noise."""
 
 import functools
 
@@ -12,7 +12,9 @@ from support.intervals import around, bounds, left_out
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.statistics import correlation_interval, scene_clusters
 from jaxnav.experiments.similarity import (
+    GainBySimilarity,
     SimilarityPoints,
+    SuccessBySimilarity,
     compute_similarity_points,
     gain_of_table,
     gain_rows,
@@ -48,7 +50,7 @@ def draw_success(seed: int, num_runs: int, points: SimilarityPoints, chance: flo
 
 
 def is_of_point(points: SimilarityPoints, scene: int, category: int) -> np.ndarray:
-    """Episodes with this goal in this scene, bool [E]."""
+    """True for the episodes with a point's goal in its scene, bool [E]."""
     return (points.episodes.scene == scene) & (points.episodes.goal == category)
 
 
@@ -64,8 +66,8 @@ def similarity_by_episode(points: SimilarityPoints, default: float) -> np.ndarra
 
 
 def test_points_and_correlation_are_as_worked():
-    # Scene 0 shows category 0 as training does: cosine 1. It shows 1 with 2 alone, where training has 0 and 2 alike:
-    # (0, 1) . (1, 1) / (1 * sqrt 2) = 0.7071. Category 2 is shown with nothing else, and makes no point.
+    # In scene 0, category 0 co-occurs with 1 and 2 as in training: cosine 1. Category 1 co-occurs with 2 only, but in
+    # training equally with 0 and 2: (0, 1) . (1, 1) / (1 * sqrt 2) = 0.7071. Category 2 has no counts, so no point.
     counts = np.array([[[0, 1, 2], [0, 0, 5], [0, 0, 0]]])
     prior = np.array([[[0, 10, 20], [30, 0, 30], [1, 1, 0]]])
     points = compute_similarity_points(episodes_in([0] * 6, [1, 0, 1, 2, 1, 0]), counts, prior)
@@ -94,14 +96,14 @@ def test_a_point_weighs_as_much_as_its_episodes(seed):
 
     # Every point by SciPy, from the co-occurrence of its category with all others.
     for index, (scene, category) in enumerate(zip(points.scene, points.category, strict=True)):
-        others = np.arange(NUM_CATEGORIES) != category
+        is_other = np.arange(NUM_CATEGORIES) != category
         members = is_of_point(points, scene, category)
-        distance = cosine(counts[scene, category, others], prior[scene, category, others])
+        distance = cosine(counts[scene, category, is_other], prior[scene, category, is_other])
         assert relation.similarity[index] == pytest.approx(1 - distance)
         assert relation.success[index] == pytest.approx(success[:, members].mean())
         assert relation.episodes[index] == members.sum()
 
-    # SciPy knows no weights, so every point is repeated.
+    # SciPy has no weights, so every point is repeated once per episode.
     similarity = np.repeat(relation.similarity, relation.episodes)
     rates = np.repeat(relation.success, relation.episodes)
     assert relation.pearson.mean == pytest.approx(pearsonr(similarity, rates)[0])
@@ -111,54 +113,58 @@ def test_a_point_weighs_as_much_as_its_episodes(seed):
 
 
 def test_the_interval_of_success_is_that_of_a_plain_loop():
-    """It leaves out each scene, each training run and both."""
-    num_scenes, num_runs = 8, 3
+    """The loop leaves out each scene, each training run, and each pair of a scene and a run."""
+    num_scenes = 8
+    num_runs = 3
     points = draw_points(num_scenes=num_scenes)
     success = draw_success(1, num_runs, points, chance=0.4)
     relation = relate_success_to_similarity(points, success)
 
-    def correlation(correlate, left_out_scene, left_out_run) -> float:
+    def fisher_z_without(correlate, left_out_scene, left_out_run) -> float:
+        """Fisher's z of the remaining points, each repeated once per episode."""
         remaining_runs = np.arange(num_runs) != left_out_run
-        similarity, rates = [], []
+        similarity = []
+        rates = []
         for index, (scene, category) in enumerate(zip(points.scene, points.category, strict=True)):
             if scene != left_out_scene:
                 rate = success[remaining_runs][:, is_of_point(points, scene, category)].mean()
                 similarity += [points.similarity[index]] * points.num_episodes[index]
                 rates += [rate] * points.num_episodes[index]
-        return np.arctanh(correlate(similarity, rates)[0])  # Fisher's z
+        return np.arctanh(correlate(similarity, rates)[0])
 
+    # The bounds are those of z, transformed back.
     for interval, correlate in ((relation.pearson, pearsonr), (relation.spearman, spearmanr)):
-        expected_z = left_out(functools.partial(correlation, correlate), num_scenes, num_runs)
+        expected_z = left_out(functools.partial(fisher_z_without, correlate), num_scenes, num_runs)
         assert bounds(interval) == pytest.approx(np.tanh(expected_z))
 
 
 def test_training_runs_that_disagree_widen_the_interval_of_success():
-    # Success that follows similarity in one run and runs against it in the other has the same mean as half of both in
-    # both runs, but further runs would not agree.
+    # The slope of success over similarity is 0.2 in two equal runs, or 0.8 in one run and -0.4 in the other. The mean
+    # over the runs is equal, but further runs would differ in the second case.
     points = draw_points()
     similarity = similarity_by_episode(points, default=0.5)
     noise = np.random.default_rng(4).normal(0, 0.05, len(similarity))
-    agreeing = np.stack([0.5 + 0.2 * similarity + noise] * 2)
-    disagreeing = agreeing + np.stack([0.6 * similarity, -0.6 * similarity])
-    agreed = relate_success_to_similarity(points, agreeing)
-    disagreed = relate_success_to_similarity(points, disagreeing)
+    equal_success = np.stack([0.5 + 0.2 * similarity + noise] * 2)
+    opposite_success = equal_success + np.stack([0.6 * similarity, -0.6 * similarity])
+    equal_relation = relate_success_to_similarity(points, equal_success)
+    opposite_relation = relate_success_to_similarity(points, opposite_success)
     for name in ("pearson", "spearman"):
-        assert getattr(agreed, name).mean == pytest.approx(getattr(disagreed, name).mean)
-        assert getattr(agreed, name).low > 0.5
-        assert getattr(disagreed, name).low < -0.5
+        assert getattr(equal_relation, name).mean == pytest.approx(getattr(opposite_relation, name).mean)
+        assert getattr(equal_relation, name).low > 0.5
+        assert getattr(opposite_relation, name).low < -0.5
 
-    # Further equal runs add nothing.
-    repeated = relate_success_to_similarity(points, agreeing[[0, 1, 0, 1]])
-    assert bounds(agreed.pearson) == pytest.approx(bounds(repeated.pearson))
+    # Further equal runs do not change the interval.
+    repeated_relation = relate_success_to_similarity(points, equal_success[[0, 1, 0, 1]])
+    assert bounds(equal_relation.pearson) == pytest.approx(bounds(repeated_relation.pearson))
 
 
 def test_room_types_keep_their_shares():
-    # Without a scene, the remaining scenes of its room type count more.
+    # If a scene is left out, the remaining scenes of its room type get its weight.
     episodes, counts, prior = draw_scenes(num_scenes=7)
     room = np.array([0, 1, 0, 1, 1, 0, 1])
     episodes = episodes._replace(room=room[episodes.scene])
     points = compute_similarity_points(episodes, counts, prior)
-    success = np.repeat(draw_success(1, 1, points, chance=0.4), 2, axis=0)  # equal runs: scenes alone vary
+    success = np.repeat(draw_success(1, 1, points, chance=0.4), 2, axis=0)  # equal runs, so only scenes vary
     relation = relate_success_to_similarity(points, success)
 
     def pearson_without(left_out_scene: int) -> float:
@@ -181,12 +187,12 @@ def test_only_success_that_follows_similarity_correlates():
     points = draw_points(num_scenes=30)
     chance = similarity_by_episode(points, default=np.sqrt(0.5)) ** 2
     draws = np.random.default_rng(2).random((5, len(chance)))
-    related = relate_success_to_similarity(points, draws < chance)
-    unrelated = relate_success_to_similarity(points, draws < 0.5)
-    assert related.pearson.low > 0.3
-    assert related.spearman.low > 0.3
-    assert unrelated.pearson.low < 0 < unrelated.pearson.high
-    assert unrelated.spearman.low < 0 < unrelated.spearman.high
+    rising_relation = relate_success_to_similarity(points, draws < chance)
+    level_relation = relate_success_to_similarity(points, draws < 0.5)
+    assert rising_relation.pearson.low > 0.3
+    assert rising_relation.spearman.low > 0.3
+    assert level_relation.pearson.low < 0 < level_relation.pearson.high
+    assert level_relation.spearman.low < 0 < level_relation.spearman.high
 
 
 def test_equal_success_has_no_correlation():
@@ -208,7 +214,7 @@ def test_gain_is_averaged_by_category(seed):
     variant = draw_success(seed + 10, 3, points, chance=0.6)
     relation = relate_gain_to_similarity(points, baseline, variant, CATEGORIES)
 
-    # Episodes without a similarity do not count.
+    # Only episodes with a similarity count.
     has_point = ~np.isnan(similarity_by_episode(points, default=np.nan))
     category_indices = sorted(set(goal[has_point]))
     assert relation.categories == tuple(CATEGORIES[category] for category in category_indices)
@@ -233,11 +239,12 @@ def test_gain_is_averaged_by_category(seed):
 
 
 def test_the_interval_of_gains_is_that_of_a_plain_loop():
-    """It leaves out each scene, each run of either arm and both."""
-    num_scenes, num_runs = 6, 3
+    """The loop leaves out each scene, each run of either arm, and each pair of a scene and a run."""
+    num_scenes = 6
+    num_runs = 3
     episodes, counts, prior = draw_scenes(4, num_scenes)
 
-    # The last category is a goal in the first scene alone: without that scene there are three.
+    # The last category is a goal in the first scene only, so that three categories remain without this scene.
     goal = np.where(episodes.scene == 0, episodes.goal, episodes.goal % (NUM_CATEGORIES - 1))
     points = compute_similarity_points(episodes._replace(goal=goal), counts + 1, prior)
     success = draw_success(4, 2 * num_runs, points)
@@ -249,7 +256,8 @@ def test_the_interval_of_gains_is_that_of_a_plain_loop():
 
     def line_without(left_out_scene, left_out_run) -> np.ndarray:
         """Slope, intercept, r, ... of the line through the remaining categories."""
-        similarities, gains = [], []
+        similarities = []
+        gains = []
         remaining_runs = np.arange(2 * num_runs) != left_out_run
         for category in range(NUM_CATEGORIES):
             members = (goal == category) & (episodes.scene != left_out_scene)
@@ -260,10 +268,17 @@ def test_the_interval_of_gains_is_that_of_a_plain_loop():
                 gains += [100 * (variant - baseline)] * members.sum()
         return np.asarray(linregress(similarities, gains))
 
-    slope = left_out(lambda *omitted: 0.1 * line_without(*omitted)[0], num_scenes, num_runs, arms=2)
-    fisher_z = left_out(lambda *omitted: np.arctanh(line_without(*omitted)[2]), num_scenes, num_runs, arms=2)
-    assert bounds(relation.slope) == pytest.approx(slope)
-    assert bounds(relation.pearson) == pytest.approx(np.tanh(fisher_z))
+    def slope_without(left_out_scene, left_out_run) -> float:
+        return 0.1 * line_without(left_out_scene, left_out_run)[0]
+
+    def fisher_z_without(left_out_scene, left_out_run) -> float:
+        return np.arctanh(line_without(left_out_scene, left_out_run)[2])
+
+    # The slope is in points per 0.1 of similarity.
+    expected_slope = left_out(slope_without, num_scenes, num_runs, arms=2)
+    expected_z = left_out(fisher_z_without, num_scenes, num_runs, arms=2)
+    assert bounds(relation.slope) == pytest.approx(expected_slope)
+    assert bounds(relation.pearson) == pytest.approx(np.tanh(expected_z))
 
 
 def test_runs_that_disagree_widen_the_interval_of_the_slope():
@@ -275,14 +290,14 @@ def test_runs_that_disagree_widen_the_interval_of_the_slope():
         variant = np.stack([0.3 + (0.4 + deviation) * similarity, 0.3 + (0.4 - deviation) * similarity])
         slopes[deviation] = relate_gain_to_similarity(points, baseline, variant, CATEGORIES).slope
 
-    # Gains rise by 4 points per 0.1 in all scenes. Where it is 7 and 1 in the runs of the variant, the mean without
-    # either moves by 3: variance 1 / 2 x (3^2 + 3^2) by run, with two degrees of freedom for two arms of two runs.
+    # Gains rise by 4 points per 0.1 in all scenes. With 7 and 1 points in the runs of the variant, the mean without
+    # either run moves by 3: variance 1 / 2 x (3^2 + 3^2) by run, with two degrees of freedom for two arms of two runs.
     assert bounds(slopes[0.0]) == pytest.approx((4, 4, 4))
     assert bounds(slopes[0.3]) == pytest.approx(around(4, 9, 2))
 
 
 def test_a_gain_that_falls_with_similarity_has_a_negative_slope():
-    # Gain = 60 points x (1 - similarity): 6 points less for each 0.1, without any scene or run.
+    # Gain = 60 points x (1 - similarity): 6 points less for each 0.1, whichever scene or run is left out.
     points = draw_points()
     baseline = np.full((2, len(points.episodes.goal)), 0.2)
     variant = baseline + 0.6 * (1 - similarity_by_episode(points, default=0.0))
@@ -292,7 +307,7 @@ def test_a_gain_that_falls_with_similarity_has_a_negative_slope():
 
 
 def test_an_equal_gain_has_no_slope():
-    # A chance of 0.3 against 0.5, whatever the similarity: the interval of the slope covers 0.
+    # The chance rises from 0.3 to 0.5 at every similarity, so the interval of the slope covers 0.
     points = draw_points(num_scenes=30)
     baseline = draw_success(3, 5, points, chance=0.3)
     variant = draw_success(4, 5, points, chance=0.5)
@@ -303,6 +318,20 @@ def test_an_equal_gain_has_no_slope():
 # Rows
 
 
+Relation = SuccessBySimilarity | GainBySimilarity
+
+
+def assert_same_relation(
+    relation: Relation, expected_relation: Relation, array_names: tuple[str, ...], interval_names: tuple[str, ...]
+) -> None:
+    """Assert that a relation read from a file equals the written one, up to the seven digits of files."""
+    for name in array_names:
+        np.testing.assert_allclose(getattr(relation, name), getattr(expected_relation, name), rtol=1e-6)
+    for name in interval_names:
+        interval = bounds(getattr(relation, name))
+        assert interval == pytest.approx(bounds(getattr(expected_relation, name)), rel=1e-6)
+
+
 def test_both_relations_are_read_back_from_a_file_of_rows(tmp_path):
     points = draw_points()
     baseline = draw_success(0, 3, points)
@@ -311,25 +340,19 @@ def test_both_relations_are_read_back_from_a_file_of_rows(tmp_path):
     variant_fields = fields | {"variant": "stde", "epsilon": 0.5}
     rows = [*success_rows(fields, points, baseline), *gain_rows(variant_fields, points, baseline, variant, CATEGORIES)]
 
-    # Rows of another shift do not disturb.
-    others = success_rows(fields | {"shift": 0.0}, points, variant)
-    write_part(tmp_path / "part.jsonl", {}, [*rows, *others])
+    # The file also has rows of another shift, which are ignored.
+    other_rows = success_rows(fields | {"shift": 0.0}, points, variant)
+    write_part(tmp_path / "part.jsonl", {}, [*rows, *other_rows])
     table = ResultTable(read_part(tmp_path / "part.jsonl"))
+
     expected_success = relate_success_to_similarity(points, baseline)
     expected_gain = relate_gain_to_similarity(points, baseline, variant, CATEGORIES)
     success = success_of_table(table, **fields)
     gain = gain_of_table(table, **variant_fields)
 
-    # Files hold seven digits.
+    assert_same_relation(success, expected_success, ("episodes", "similarity", "success"), ("pearson", "spearman"))
     assert gain.categories == expected_gain.categories
-    for read, expected, arrays, intervals in (
-        (success, expected_success, ("episodes", "similarity", "success"), ("pearson", "spearman")),
-        (gain, expected_gain, ("similarity", "baseline", "gain"), ("slope", "pearson")),
-    ):
-        for name in arrays:
-            np.testing.assert_allclose(getattr(read, name), getattr(expected, name), rtol=1e-6)
-        for name in intervals:
-            assert bounds(getattr(read, name)) == pytest.approx(bounds(getattr(expected, name)), rel=1e-6)
+    assert_same_relation(gain, expected_gain, ("similarity", "baseline", "gain"), ("slope", "pearson"))
 
 
 def test_the_interval_of_a_perfect_correlation_is_finite():

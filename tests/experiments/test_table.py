@@ -1,4 +1,4 @@
-"""Rows of results: JSON lines and back, and the table that finds them."""
+"""Rows of results: round trips through files, refusals of files, and look-ups in the table."""
 
 import json
 import math
@@ -43,36 +43,38 @@ def write_and_read(path: Path, *rows: ResultRow) -> list[ResultRow]:
     return read_part(path)
 
 
-def assert_same_number(read: float, written: float) -> None:
-    """Assert that a number was read as it was written, up to seven digits."""
-    if math.isnan(written):
-        assert math.isnan(read)
+def assert_same_number(number: float, expected_number: float) -> None:
+    """Assert that a number read from a file equals the written one up to seven digits, with its sign."""
+    if math.isnan(expected_number):
+        assert math.isnan(number)
     else:
-        assert read == pytest.approx(written, rel=6e-7, abs=0.0)
-        assert math.copysign(1.0, read) == math.copysign(1.0, written)
+        assert number == pytest.approx(expected_number, rel=6e-7, abs=0.0)
+        assert math.copysign(1.0, number) == math.copysign(1.0, expected_number)
 
 
-def assert_same_row(read: ResultRow, written: ResultRow) -> None:
-    """Assert that a row has the same fields and, up to seven digits, the same value."""
+def assert_same_row(row: ResultRow, expected_row: ResultRow) -> None:
+    """Assert that a row read from a file has the fields of the written one and, up to seven digits, its value."""
     for name in (*KEY_FIELDS, "scenes"):
-        assert getattr(read, name) == getattr(written, name)
-    assert type(read.value) is type(written.value)
+        assert getattr(row, name) == getattr(expected_row, name)
+    value = row.value
+    expected_value = expected_row.value
+    assert type(value) is type(expected_value)
 
-    # All numbers of an interval or curve; the deviation follows from the seeds.
-    if isinstance(written.value, Interval) and isinstance(read.value, Interval):
+    # All numbers of an interval or curve are compared; the deviation follows from the seeds.
+    if isinstance(expected_value, Interval) and isinstance(value, Interval):
         for name in ("mean", "low", "high"):
-            assert_same_number(getattr(read.value, name), getattr(written.value, name))
-        assert read.value.seeds == pytest.approx(written.value.seeds, rel=6e-7)
-    elif isinstance(written.value, Curve) and isinstance(read.value, Curve):
+            assert_same_number(getattr(value, name), getattr(expected_value, name))
+        assert value.seeds == pytest.approx(expected_value.seeds, rel=6e-7)
+    elif isinstance(expected_value, Curve) and isinstance(value, Curve):
         for name in ("positions", "mean", "low", "high"):
-            for numbers in zip(getattr(read.value, name), getattr(written.value, name), strict=True):
-                assert_same_number(*numbers)
+            for number, expected_number in zip(getattr(value, name), getattr(expected_value, name), strict=True):
+                assert_same_number(number, expected_number)
 
 
 # Files
 
 
-def test_a_file_gives_back_intervals_and_curves(tmp_path):
+def test_intervals_and_curves_survive_a_file(tmp_path):
     rows = [
         make_row(Interval(62.5, 60.25, 64.75, 2.5, (60.0, 62.5, 65.0)), variant="stde", epsilon=0.5, shift=0.0),
         make_row(Interval(-1.25, -2.0, -0.5), variant="stde", reference="layout", shift=1.0, scenes=80),
@@ -89,11 +91,11 @@ def test_a_file_gives_back_intervals_and_curves(tmp_path):
 def test_the_deviation_over_runs_is_computed_from_the_seeds(tmp_path):
     # 60, 62.5 and 65: sample variance (2.5^2 + 0 + 2.5^2) / 2 = 6.25. A single run has none.
     rows = [make_row(Interval(62.5, seeds=(60.0, 62.5, 65.0))), make_row(Interval(1.0, seeds=(1.0,)))]
-    several, single = write_and_read(tmp_path / "part.jsonl", *rows)
-    assert isinstance(several.value, Interval)
-    assert isinstance(single.value, Interval)
-    assert several.value.std == 2.5
-    assert math.isnan(single.value.std)
+    three_runs, single_run = write_and_read(tmp_path / "part.jsonl", *rows)
+    assert isinstance(three_runs.value, Interval)
+    assert isinstance(single_run.value, Interval)
+    assert three_runs.value.std == 2.5
+    assert math.isnan(single_run.value.std)
 
 
 NUMBERS = st.floats(-1e9, 1e9, allow_subnormal=False)
@@ -104,8 +106,15 @@ INTERVALS = st.builds(
     NUMBERS | st.just(math.nan),
     seeds=st.lists(NUMBERS, max_size=3).map(tuple),
 )
+
+
+def curve_through(points: list[tuple[float, float, float, float]]) -> Curve:
+    """Curve through points of position, mean, low and high."""
+    return Curve(*np.array(points, float).reshape(-1, 4).T)
+
+
 POINTS = st.tuples(NUMBERS, *3 * [NUMBERS | st.just(math.nan)])
-CURVES = st.lists(POINTS, max_size=3).map(lambda points: Curve(*np.array(points, float).reshape(-1, 4).T))
+CURVES = st.lists(POINTS, max_size=3).map(curve_through)
 ROWS = st.builds(
     ResultRow,
     **dict.fromkeys(("world", "run", "metric"), st.text(min_size=1, max_size=4)),
@@ -119,11 +128,11 @@ ROWS = st.builds(
 
 @settings(max_examples=60)
 @given(st.lists(ROWS, max_size=4))
-def test_a_file_gives_back_any_rows(rows):
+def test_any_rows_survive_a_file(rows):
     with tempfile.TemporaryDirectory() as folder:
         read_rows = write_and_read(Path(folder) / "part.jsonl", *rows)
     for read_row, row in zip(read_rows, rows, strict=True):
-        # A lower bound that is missing at all points stands for both.
+        # A curve without any lower bound is stored without bounds.
         if isinstance(row.value, Curve) and np.isnan(row.value.low).all():
             row.value.high[:] = math.nan
         assert_same_row(read_row, row)
@@ -132,22 +141,24 @@ def test_a_file_gives_back_any_rows(rows):
 def test_fields_that_all_rows_share_are_written_once(tmp_path):
     path = tmp_path / "part.jsonl"
     write_part(path, {}, [make_row(float(number), metric=f"metric{number}") for number in range(3)])
-    head, *lines = map(json.loads, path.read_text().splitlines())
+    head, *row_objects = map(json.loads, path.read_text().splitlines())
     assert head["shared"] == {"world": "rooms", "run": "org"}
-    assert lines == [{"metric": f"metric{number}", "mean": number} for number in range(3)]
+    assert row_objects == [{"metric": f"metric{number}", "mean": number} for number in range(3)]
 
 
 @pytest.mark.parametrize("means", [(-0.0, 0.0), (0.0, -0.0), (-0.0, -0.0)])
 def test_zero_keeps_its_sign(tmp_path, means):
-    first, second = write_and_read(
-        tmp_path / "part.jsonl", make_row(means[0], metric="a"), make_row(make_curve(means[1]), metric="b")
-    )
-    assert_same_row(first, make_row(means[0], metric="a"))
-    assert_same_row(second, make_row(make_curve(means[1]), metric="b"))
-    # Nor may rows of either sign share it.
-    rows = write_and_read(tmp_path / "part.jsonl", *(make_row(mean, metric=str(mean)) for mean in means))
-    for read_row, mean in zip(rows, means, strict=True):
-        assert_same_row(read_row, make_row(mean, metric=str(mean)))
+    path = tmp_path / "part.jsonl"
+    interval_row = make_row(means[0], metric="a")
+    curve_row = make_row(make_curve(means[1]), metric="b")
+    read_interval_row, read_curve_row = write_and_read(path, interval_row, curve_row)
+    assert_same_row(read_interval_row, interval_row)
+    assert_same_row(read_curve_row, curve_row)
+
+    # Rows whose zeros have different signs do not share the mean.
+    rows = [make_row(mean, metric=str(mean)) for mean in means]
+    for read_row, row in zip(write_and_read(path, *rows), rows, strict=True):
+        assert_same_row(read_row, row)
 
 
 def test_fields_keep_all_digits_so_that_rows_are_found_by_them(tmp_path):
@@ -174,18 +185,20 @@ def test_a_file_without_rows_is_a_part(tmp_path):
     assert has_part(path, SETTINGS)
 
 
-def test_a_file_holds_the_results_of_its_settings_alone(tmp_path):
+def test_a_file_has_only_the_results_of_its_settings(tmp_path):
     path = tmp_path / "part.jsonl"
     assert not has_part(path, SETTINGS)
     write_part(path, SETTINGS, [make_row()])
     assert has_part(path, SETTINGS)
     assert not has_part(path, SETTINGS | {"split": "test"})
     assert not has_part(path, SETTINGS | {"run": {"method": "org", "seeds": 4}})
-    # Readers name the settings that matter to them.
+
+    # Readers may require some of the settings.
     assert len(read_part(path, {"split": "val"})) == 1
     assert read_part(path, {"split": "test"}) == []
     assert read_part(path, {"episodes": 1}) == []
-    # Files without the kind of the shift are of earlier versions, which shifted by size.
+
+    # Earlier versions shifted by size, and their files do not tell the kind of the shift.
     assert len(read_part(path, {"shift_by": "size"})) == 1
     assert read_part(path, {"shift_by": "context"}) == []
 
@@ -219,12 +232,12 @@ def test_a_damaged_file_is_refused_by_its_name(tmp_path, content):
 
 
 def test_a_file_of_another_format_is_neither_read_nor_called_damaged(tmp_path):
-    """Only damaged files may be measured again, and replaced."""
+    """Only damaged files may be measured again and replaced."""
     path = tmp_path / "part.jsonl"
     path.write_text(GOOD_HEAD.replace(": 4", ": 3"))
-    for read in (read_part, read_settings):
+    for read_file in (read_part, read_settings):
         with pytest.raises(InputError, match=r"part\.jsonl: holds no results of format 4; move it away"):
-            read(path)
+            read_file(path)
 
 
 # The table
@@ -247,16 +260,18 @@ def test_rows_are_found_by_all_of_their_fields():
     assert TABLE.find(fields, variant="layout", shift=0.0).mean == 70.0
     assert TABLE.find(fields, variant="layout", shift=0.0, reference="baseline").mean == 10.0
     assert TABLE.find(fields, run="hoz").mean == 5.0  # the later field counts
-    # Fields that are not given are empty: the first two rows have a shift.
+
+    # Fields that are not given must be empty, but the first two rows have a shift.
     assert not TABLE.has(fields, variant="baseline")
     assert math.isnan(TABLE.find(fields, variant="baseline").mean)
-    # A curve is no interval.
+
+    # A curve is found by `has`, but is no interval.
     assert TABLE.has(fields, metric="gap")
     assert math.isnan(TABLE.find(fields, metric="gap").mean)
 
 
 def test_rows_with_equal_fields_must_have_equal_values():
-    # Experiments may share a folder, and then results such as those of frontier search; scenes are not compared.
+    # Experiments that share a folder may share results, such as those of frontier search. The scenes are not compared.
     table = ResultTable([make_row(1.0, scenes=80), make_row(1.0, scenes=40)])
     assert table.find(world="rooms", run="org", metric="sr").mean == 1.0
     with pytest.raises(InputError, match="org"):
@@ -278,7 +293,8 @@ def test_a_curve_is_read_at_a_position():
     assert TABLE.curve(fields).mean.tolist() == [0.9, 0.7, 0.5]
     interval = TABLE.find_at(2, fields)
     assert (interval.mean, interval.low, interval.high) == pytest.approx((0.5, 0.4, 0.6))
-    # There is nothing behind the end, in other rows, and in rows without a curve.
+
+    # Values are undefined behind the end, in missing rows, and in rows without a curve.
     assert math.isnan(TABLE.find_at(3, fields).mean)
     assert math.isnan(TABLE.find_at(0, fields, run="hoz").mean)
     assert math.isnan(TABLE.find_at(0, fields, run="hoz", metric="sr").mean)
