@@ -558,6 +558,69 @@ def test_hosts_with_idle_experience_have_no_verdict(tmp_path):
     assert "experience is idle" in idle_cells[-1]
 
 
+def test_orderings_on_the_test_split_stand_next_to_those_on_val(tmp_path):
+    # On `val` w gains 5 points and hard TDE loses 4; on `test` w loses 3 and hard TDE 2. HOZ has no results on `test`.
+    shares = [make_share("org", "layout", 20.0), make_share("hoz", "layout", 20.0)]
+    val_rows = [
+        *make_agent_rows("rooms", "org", layout=75.0),
+        make_effect("rooms", "org", "layout", "baseline", make_interval(5.0)),
+        make_effect("rooms", "org", "tde", "layout", make_interval(-4.0)),
+        make_effect("rooms", "hoz", "layout", "baseline", make_interval(5.0)),
+    ]
+    test_rows = [
+        *make_agent_rows("rooms", "org", layout=71.0),
+        make_effect("rooms", "org", "layout", "baseline", make_interval(-3.0)),
+        make_effect("rooms", "org", "tde", "layout", make_interval(-2.0)),
+    ]
+    tables = {"val": ResultTable(val_rows + shares), "test": ResultTable(test_rows)}
+    text = render_page(tmp_path / "page.md", "paper", parse_study(["table2"]), tables, [])
+    orderings, rest = text.split("### On the split `test`, evaluated once")
+    test_section, paper_tables = rest.split("## The three tables")
+
+    # Verdicts are about `test`. In the paper w gains 71.40 - 66.48 points, and w is 71.40 - 69.24 points above TDE.
+    cells = read_lines(test_section)
+    assert cells["rooms: `org` + w over `org`"] == [
+        "+4.9",
+        "+5.0 [+4.0, +6.0]",
+        "-3.0 [-4.0, -2.0]",
+        "20.0 [19.0, 21.0]",
+        "refuted",
+    ]
+    assert cells["rooms: `org` + w over `org` + w + TDE"] == [
+        "+2.2",
+        "+4.0 [+3.0, +5.0]",
+        "+2.0 [+1.0, +3.0]",
+        "",
+        "holds",
+    ]
+    assert "`hoz`" not in test_section
+    assert read_lines(orderings)["rooms: `org` + w over `org`"][-1] == "holds"
+
+    # SR on `test` is the last column of a world in the three tables.
+    table_1 = read_lines(paper_tables.split("###")[1])
+    assert [cell.partition(" ")[0] for cell in table_1["`org` + w"][-4:]] == ["75.0", "-", "-", "71.0"]
+
+    # Without results on `test` there is neither the section nor the column.
+    text = render_page(tmp_path / "page.md", "paper", parse_study(["table2"]), {"val": tables["val"]}, [])
+    assert "evaluated once" not in text
+    assert "test: SR" not in text
+
+
+def test_idle_experience_has_no_verdict_on_the_test_split(tmp_path):
+    agents = {"anonymous": {"method": "anonymous", "arms": ["baseline"]}, "org": {"against": ["anonymous"]}}
+    config = ExperimentConfig(agents=agents, shifts=(0.0,))
+    rows = [
+        *make_agent_rows("rooms", "org", baseline=60.0, layout=65.0),
+        make_effect("rooms", "org", "baseline", "anonymous/baseline", make_interval(10.0)),
+        make_effect("rooms", "org", "layout", "baseline", make_interval(5.0)),
+    ]
+    tables = {"val": ResultTable([*rows, make_share("org", "layout", 2.0)]), "test": ResultTable(rows)}
+    text = render_page(tmp_path / "page.md", "methods", config, tables, [])
+    cells = read_lines(text.split("evaluated once")[1].split("</details>")[0])
+    assert cells["`org` over `anonymous`"][-1] == "holds"
+    assert cells["`org` + w over `org`"][-1] == '<span class="idle">experience is idle</span>'
+
+
 def test_methods_with_idle_experience_have_no_verdict(tmp_path):
     agents = {
         "anonymous": {"method": "anonymous", "arms": ["baseline"]},
