@@ -1,4 +1,4 @@
-"""The import command: every format gives a scene file that trains, splits by pattern, and refusals."""
+"""The import command: scene files from every format, splits and selections, reports and refusals."""
 
 import gzip
 import json
@@ -37,7 +37,10 @@ def write_lines(path, *documents):
 def test_import_makes_an_environment_of_every_format(tmp_path, capsys, scene_format):
     source = scene_format.write(tmp_path, scene_format.content)
     target = tmp_path / "new" / "scenes.jsonl.gz"
-    options = [tmp_path / option if option.endswith(".pbz2") else option for option in scene_format.options]
+    options = []
+    for option in scene_format.options:
+        is_map_file = option.endswith(".pbz2")
+        options.append(tmp_path / option if is_map_file else option)
     categories = ("Chair", "Bed", "Fridge", "Sink", "DiningTable")
     exit_code = import_scenes(
         scene_format.name, source, target, "--split", "val", "--categories", *categories, *options
@@ -47,7 +50,7 @@ def test_import_makes_an_environment_of_every_format(tmp_path, capsys, scene_for
     assert "scenes imported, 0 refused" in output
     assert {scene.split for scene in read_scenes(target)} == {"val"}
 
-    # The table of ProcTHOR's house is no goal of the houses, but can be one of a task.
+    # The dining table of ProcTHOR's house is no goal in the world `houses`; another task makes it one.
     if scene_format.name == "procthor":
         task = Task(("DiningTable", "Bowl"), rules=WORLDS["houses"].task.rules)
         check_environment(*make("houses", "val", target, task), num_steps=8)
@@ -65,7 +68,7 @@ def test_import_divides_a_file_into_splits_by_pattern(tmp_path, capsys):
     assert import_scenes("scenes", first_target, second_target, "--test", "FloorPlan1", "--split", "train") == 0
     assert [scene.split for scene in read_scenes(second_target)] == ["test", "train", "train", "train"]
 
-    # Without a split, scenes of a scene file keep theirs: no test scene becomes one of training.
+    # Without an option for splits, every scene of a scene file keeps its split, so no test scene is trained on.
     kept_target = tmp_path / "c.jsonl.gz"
     assert import_scenes("scenes", first_target, kept_target, "--largest", "99") == 0
     assert [scene.split for scene in read_scenes(kept_target)] == ["train", "val", "test", "val"]
@@ -90,14 +93,14 @@ def test_import_selects_homes_by_room_type_and_size(tmp_path, capsys):
     assert [scene.name for scene in read_scenes(kitchen_target)] == ["houses-2"]
 
 
-# What an import reports
+# Reports
 
 
 def test_import_counts_refused_scenes_and_keeps_the_rest(tmp_path, capsys):
     house_without_wall = HOUSE | {"doors": [door("wall|9|0.00|0.00|1.00|0.00", 1.0, 2.0)]}
-    lines = "\n".join(json.dumps(house) for house in (HOUSE, house_without_wall))
+    house_lines = "\n".join(json.dumps(house) for house in (HOUSE, house_without_wall))
     source = tmp_path / "houses.jsonl.gz"
-    source.write_bytes(gzip.compress(lines.encode()))
+    source.write_bytes(gzip.compress(house_lines.encode()))
     target = tmp_path / "scenes.jsonl.gz"
     assert import_scenes("procthor", source, target) == 0
 
@@ -110,7 +113,7 @@ def test_import_counts_refused_scenes_and_keeps_the_rest(tmp_path, capsys):
     assert "1 scenes imported, 1 refused" in output
     assert len(read_scenes(target)) == 1
 
-    # The account of the two houses, of two objects each.
+    # The summary counts two houses of two objects each.
     assert "scenes: 2 read, 1 kept, 1 skipped (1 refused)" in output
     assert "objects: 4 read, 2 kept, 2 skipped (2 in refused scenes)" in output
 
@@ -146,14 +149,15 @@ def test_import_counts_unconnected_cells(tmp_path, capsys):
 
 
 def test_import_summarises_unknown_types_in_one_line(tmp_path, capsys):
-    # Nine types, two of them twice, beside the table and the drawer of the room.
+    # Nine unknown types, two of them twice, in addition to the table and the drawer of the room.
     drawer = METADATA["objects"][1]
     unknown_objects = [drawer | {"objectId": f"T{index}", "objectType": f"T{index}"} for index in range(9)]
     objects = METADATA["objects"] + unknown_objects + unknown_objects[:2]
     source = write_lines(tmp_path / "room.json", METADATA | {"objects": objects})
     assert import_scenes("ai2thor", source, tmp_path / "scenes.jsonl.gz") == 0
-    (line,) = [line for line in capsys.readouterr().err.splitlines() if "unknown types" in line]
-    assert line.endswith(": 13, of them T0 x 2, T1 x 2, DiningTable x 1, Drawer x 1, T2 x 1 and 6 more")
+    output = capsys.readouterr().err
+    (type_line,) = [line for line in output.splitlines() if "unknown types" in line]
+    assert type_line.endswith(": 13, of them T0 x 2, T1 x 2, DiningTable x 1, Drawer x 1, T2 x 1 and 6 more")
 
 
 def test_import_refuses_a_repeated_scene_name(tmp_path, capsys):
@@ -170,8 +174,10 @@ def test_import_skips_bad_lines_of_a_scene_file(tmp_path, capsys):
     mixed_file = tmp_path / "mixed.jsonl.gz"
     assert import_scenes("ai2thor", room_file, good_file) == 0
     _, good_line = gzip.decompress(good_file.read_bytes()).splitlines(keepends=True)  # after the header
-    unknown_split = good_line.replace(b'"train"', b'"trial"')
-    mixed_file.write_bytes(good_line + unknown_split + b"{]\n" + good_line)
+
+    # An unknown split, a line that is not JSON, and a repeated scene.
+    bad_split_line = good_line.replace(b'"train"', b'"trial"')
+    mixed_file.write_bytes(good_line + bad_split_line + b"{]\n" + good_line)
     assert import_scenes("scenes", mixed_file, tmp_path / "o.jsonl.gz") == 0
     output = capsys.readouterr().err
     assert "1 scenes imported, 3 refused" in output
@@ -187,16 +193,17 @@ def test_import_repeats_itself_and_replaces_no_other_scenes(tmp_path, capsys):
     assert import_scenes("ai2thor", source, target) == 0
     content = target.read_bytes()
 
-    # The same import again, also over a file that another program has compressed.
+    # An import may be repeated, even if another program has compressed its file in the meantime.
     target.write_bytes(gzip.compress(gzip.decompress(content), compresslevel=1))
     assert import_scenes("ai2thor", source, target) == 0
     assert target.read_bytes() == content
 
-    # Other splits, an account of other objects, the scenes alone, a file of another kind, and a damaged file.
+    # Other splits, a header with another account, no header, a file of another kind, and a damaged file.
+    lines = gzip.decompress(content).splitlines(keepends=True)
     options_and_files = (
         (("--split", "val"), content),
-        ((), gzip.compress(gzip.decompress(content).replace(b"objects", b"goals", 1))),
-        ((), gzip.compress(b"".join(gzip.decompress(content).splitlines(keepends=True)[1:]))),
+        ((), gzip.compress(b"".join(lines).replace(b"objects", b"goals", 1))),
+        ((), gzip.compress(b"".join(lines[1:]))),
         ((), b"a file of my own"),
         ((), content[:-9]),
     )
@@ -235,8 +242,9 @@ def test_import_refuses_a_selection_without_scenes(tmp_path, capsys, options, pr
 )
 def test_failed_import_writes_nothing(tmp_path, monkeypatch, capsys, arguments, problem):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "room.json").write_text(json.dumps(METADATA))
-    (tmp_path / "cut.json.gz").write_bytes(gzip.compress(json.dumps(METADATA).encode())[:-9])
+    room_text = json.dumps(METADATA)
+    (tmp_path / "room.json").write_text(room_text)
+    (tmp_path / "cut.json.gz").write_bytes(gzip.compress(room_text.encode())[:-9])
     paths_before = sorted(tmp_path.rglob("*"))
     assert import_scenes("ai2thor", *arguments) == 2
     output = capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""The study command: its options, what it refuses, and what it prints of a finished run."""
+"""The study command: its options, its refusals, and the results of a finished run."""
 
 import pytest
 from support.commands import contents, refusal
@@ -34,15 +34,17 @@ def drawn_run(tmp_path_factory) -> Run:
 
 @pytest.fixture
 def experiment(tmp_path):
-    """A small experiment with a template of its own, and all its files below a folder."""
-    template = tmp_path / "template.md"
-    template.write_text(TEMPLATE)
+    """File of a small experiment, with a template and a page next to it."""
+    template_path = tmp_path / "template.md"
+    template_path.write_text(TEMPLATE)
+    page_path = tmp_path / "page.md"
     path = tmp_path / "experiment.yaml"
-    path.write_text(EXPERIMENT.replace("PAGE", str(tmp_path / "page.md")).replace("TEMPLATE", str(template)))
+    path.write_text(EXPERIMENT.replace("PAGE", str(page_path)).replace("TEMPLATE", str(template_path)))
     return path
 
 
 def study(*options) -> int:
+    """Run the study command, and return its exit code."""
     return commands.main(["study", *map(str, options)])
 
 
@@ -56,20 +58,21 @@ def test_study_help_lists_experiments_and_settings(capsys):
     assert {*EXPERIMENTS, "--run", "--reference", "--split", "--episodes"} <= set(words)
 
 
-def test_a_smaller_version_is_an_experiment_of_its_own(capsys):
-    assert parse_study(["study", "--config", "rooms", "--episodes", "7"]) == parse_study(
-        ["study_rooms", "--episodes", "7"]
-    )
+def test_config_option_selects_another_version_of_an_experiment(capsys):
+    config = parse_study(["study", "--config", "rooms", "--episodes", "7"])
+    assert config == parse_study(["study_rooms", "--episodes", "7"])
+
+    # A version that does not exist is refused.
     assert study("study", "--config", "quik") == 2
     assert "--config quik: is unknown; choose from ithor, rooms" in refusal(capsys)
     assert study("table3", "--config", "quick") == 2
     assert "table3 has no other version; omit --config" in refusal(capsys)
 
 
-def test_pages_of_other_results_are_written_beside_them():
+def test_results_option_moves_the_pages_unless_they_are_given():
     pages = {"docs/few_scenes.md": "factors"}
     assert parse_study(["few_scenes"]).pages == pages
-    # Stored pages are replaced only if the command names them.
+    # Pages of other results are written next to them: stored pages are replaced only if the command names them.
     assert parse_study(["few_scenes", "--results", "new/results"]).pages == {"new/results/few_scenes.md": "factors"}
     assert parse_study(["few_scenes", "--results=new"]).pages == {"new/few_scenes.md": "factors"}
     assert parse_study(["few_scenes", "--results", "new", "--pages", "{docs/few_scenes.md: factors}"]).pages == pages
@@ -83,7 +86,7 @@ def test_study_lists_the_experiments_for_an_unknown_one(capsys):
 
 
 @pytest.mark.parametrize(
-    ("options", "named"),
+    ("options", "error_part"),
     [
         (["--shifts", "1", "0"], "shifts"),
         (["--epsilon", "-1"], "epsilon"),
@@ -102,17 +105,17 @@ def test_study_lists_the_experiments_for_an_unknown_one(capsys):
     ],
 )
 def test_study_refuses_bad_settings_in_one_line_and_writes_nothing(
-    experiment, tmp_path, monkeypatch, capsys, options, named
+    experiment, tmp_path, monkeypatch, capsys, options, error_part
 ):
     monkeypatch.chdir(tmp_path)
-    before = contents(tmp_path)
+    contents_before = contents(tmp_path)
     assert study(experiment, *options) == 2
     output = capsys.readouterr()
     assert output.out == ""
     (error,) = output.err.splitlines()
     assert error.startswith("error: ")
-    assert named in error
-    assert contents(tmp_path) == before
+    assert error_part in error
+    assert contents(tmp_path) == contents_before
 
 
 @pytest.mark.parametrize(("option", "value"), [("--split", "all"), ("--worlds", "[1"), ("--agents", "{near: 1}")])
@@ -123,16 +126,16 @@ def test_study_names_options_of_wrong_type(experiment, capsys, option, value):
 
 
 @pytest.mark.parametrize(
-    ("text", "named"),
+    ("text", "error_part"),
     [("shifts: [0.0", "line"), ("shfits: [0.0]", "shfits"), ("shifts: 0.0", "shifts"), ("agents: {a: 1}", "agents")],
 )
-def test_study_names_file_and_key_of_a_bad_config(tmp_path, capsys, text, named):
+def test_study_names_file_and_key_of_a_bad_config(tmp_path, capsys, text, error_part):
     path = tmp_path / "bad.yaml"
     path.write_text(text)
     assert study(path) == 2
     error = refusal(capsys)
     assert str(path) in error
-    assert named in error
+    assert error_part in error
 
 
 @pytest.mark.parametrize("name", ["account", "mixture", "instrument", "compare"])
@@ -150,10 +153,10 @@ def test_former_commands_name_their_replacement(capsys, name):
 def test_study_of_a_run_prints_and_stores_the_results(experiment, drawn_run, capsys):
     run_dir = drawn_run.config.run_dir
     assert study(experiment, "--run", run_dir) == 0
-    printed = capsys.readouterr().out
+    output = capsys.readouterr().out
     # Control characters of a title would change the terminal.
-    assert "# Search \\x1b[31m in red" in printed
-    assert "| main | sr | " in printed
+    assert "# Search \\x1b[31m in red" in output
+    assert "| main | sr | " in output
     assert (run_dir / "page.md").exists()
     assert [path.stem for path in (run_dir / "results" / "val").iterdir()] == ["rooms-main-frontier"]
 
@@ -163,11 +166,11 @@ def test_study_account_of_a_run_over_itself_is_zero_for_the_baseline(drawn_run, 
     # The run itself stands in for layout-blind agents, so that its baseline has no lead.
     run_dir = drawn_run.config.run_dir
     assert study("account", "--run", run_dir, "--reference", run_dir, "--episodes", 24) == 0
-    printed = capsys.readouterr().out
-    assert printed.strip() == (run_dir / "account.md").read_text().strip()
+    output = capsys.readouterr().out
+    assert output.strip() == (run_dir / "account.md").read_text().strip()
+
+    # Each shift has one row of the baseline.
     for shift in (0, 1):
-        section = printed.partition(f"Leads at shift {shift}")[2]
-        (baseline,) = [
-            line for line in section.partition("Leads at")[0].splitlines() if line.startswith("| `main` | best")
-        ]
-        assert baseline.count("+0.0") >= 4
+        section = output.partition(f"Leads at shift {shift}")[2].partition("Leads at")[0]
+        (baseline_row,) = [line for line in section.splitlines() if line.startswith("| `main` | best")]
+        assert baseline_row.count("+0.0") >= 4

@@ -1,4 +1,4 @@
-"""The sweep command end to end, and its refusals."""
+"""The sweep command end to end, the names of its files, and its refusals."""
 
 import dataclasses
 import json
@@ -25,17 +25,20 @@ def run_dir(tmp_path_factory):
 def test_sweep_prints_a_table_and_writes_figure_and_numbers(run_dir, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     assert main([str(run_dir), *OPTIONS]) == 0
-    printed = capsys.readouterr()
-    assert max(map(len, printed.out.splitlines()[:20])) <= 80
-    for shift in (0, 1):
-        assert f"shift {shift} " in printed.out
-    assert "95 % intervals over 2 training seeds and 4 floor plans." in printed.out
-    assert "1 compilation for all thresholds, seeds and shifts\n" in printed.err
-    assert (run_dir / "sweep-val-episodes24-epsilon0-0.5.png").read_bytes().startswith(b"\x89PNG")
 
+    # The table fits the terminal.
+    output = capsys.readouterr()
+    assert max(map(len, output.out.splitlines()[:20])) <= 80
+    for shift in (0, 1):
+        assert f"shift {shift} " in output.out
+    assert "95 % intervals over 2 training seeds and 4 floor plans." in output.out
+    assert "1 compilation for all thresholds, seeds and shifts\n" in output.err
+
+    # File names hold the options that differ from the defaults.
+    assert (run_dir / "sweep-val-episodes24-epsilon0-0.5.png").read_bytes().startswith(b"\x89PNG")
     assert (run_dir / "latest-sweep.txt").read_text() == "sweep-val-episodes24-epsilon0-0.5.json\n"
 
-    # The numbers are those of the call in Python.
+    # The function `jaxnav.sweep` gives the numbers of the file.
     numbers = json.loads((run_dir / "sweep-val-episodes24-epsilon0-0.5.json").read_text())
     assert numbers["compilations"] == 1
     assert numbers["settings"]["seeds"] == 2
@@ -48,24 +51,26 @@ def test_sweep_prints_a_table_and_writes_figure_and_numbers(run_dir, capsys, mon
 
 @pytest.mark.slow
 def test_sweep_prints_markdown(run_dir, tmp_path, capsys):
-    out = tmp_path / "figure.png"
-    assert main([str(run_dir), *OPTIONS, "--shift", "0", "--out", str(out), "--format", "markdown"]) == 0
+    figure_path = tmp_path / "figure.png"
+    assert main([str(run_dir), *OPTIONS, "--shift", "0", "--out", str(figure_path), "--format", "markdown"]) == 0
+
+    # All rows have equally many columns.
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("| Shift | Threshold | SR (%) |")
     assert len({line.count("|") for line in lines if line.startswith("|")}) == 1
-    assert out.exists()
-    assert out.with_suffix(".json").exists()
+    assert figure_path.exists()
+    assert figure_path.with_suffix(".json").exists()
 
 
 @pytest.mark.slow
 def test_sweep_without_plotting_packages_prints_and_writes_numbers(run_dir, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    out = tmp_path / "figure.png"
-    assert main([str(run_dir), *OPTIONS, "--shift", "0", "--out", str(out)]) == 0
-    printed = capsys.readouterr()
-    assert "Threshold" in printed.out
-    assert "no figure: " in printed.err
-    assert "pip install 'jaxnav[viz]'" in printed.err
+    figure_path = tmp_path / "figure.png"
+    assert main([str(run_dir), *OPTIONS, "--shift", "0", "--out", str(figure_path)]) == 0
+    output = capsys.readouterr()
+    assert "Threshold" in output.out
+    assert "no figure: " in output.err
+    assert "pip install 'jaxnav[viz]'" in output.err
     assert [path.name for path in tmp_path.iterdir()] == ["figure.json"]
 
 
@@ -73,7 +78,7 @@ def test_default_thresholds_are_those_of_the_function():
     assert SweepConfig("run").epsilon == SWEPT_THRESHOLDS
 
 
-def test_file_names_differ_by_what_is_evaluated():
+def test_figure_name_holds_the_options_of_the_sweep():
     configs = [
         SweepConfig("run"),
         SweepConfig("run", world="houses", form="switch", hold=True),
@@ -90,6 +95,7 @@ def test_file_names_differ_by_what_is_evaluated():
 
 
 def test_sweeps_of_other_settings_have_other_files(tmp_path):
+    # Other values of every option that changes the results.
     other_options = {
         "split": ("train", "test"),
         "world": ("rooms",),
@@ -104,12 +110,14 @@ def test_sweeps_of_other_settings_have_other_files(tmp_path):
         "hold": (True,),
         "seed": (1,),
     }
-    fields = {field.name for field in dataclasses.fields(SweepConfig)}
-    assert other_options.keys() == fields - {"source", "out", "format"}
+    field_names = {field.name for field in dataclasses.fields(SweepConfig)}
+    assert other_options.keys() == field_names - {"source", "out", "format"}
 
     configs = [SweepConfig("run")]
     for name, values in other_options.items():
-        configs += [dataclasses.replace(SweepConfig("run"), **{name: value}) for value in values]
+        for value in values:
+            configs.append(dataclasses.replace(SweepConfig("run"), **{name: value}))
+
     # Two policies of one name in two folders write into the working directory.
     for folder in ("a", "b"):
         policy_dir = tmp_path / folder / "layout-0"

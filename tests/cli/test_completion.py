@@ -1,4 +1,4 @@
-"""The scripts that complete commands in a shell; that of bash is tried where bash is installed."""
+"""Scripts that complete commands in a shell; the script of bash is also run where bash is installed."""
 
 import shutil
 import subprocess
@@ -22,9 +22,9 @@ def bash_script(tmp_path_factory):
 
 
 def complete(script, *words: str) -> set[str]:
-    """Return what bash offers for the last word of a command line."""
+    """Return the completions that bash offers for the last word of a command line."""
     quoted_words = " ".join(f"'{word}'" for word in ("jaxnav", *words))
-    # The function that the script registers for `jaxnav`.
+    # Call the function that the script registers for `jaxnav`.
     code = f"""
 source {script}
 COMP_WORDS=({quoted_words}); COMP_CWORD={len(words)}; COMPREPLY=()

@@ -1,4 +1,4 @@
-"""What all commands share: where compiled programs are kept, and memory that compilations free."""
+"""Parts shared by all commands: the cache of compiled programs, memory after compilations, and printed tables."""
 
 import ctypes
 from pathlib import Path
@@ -15,14 +15,19 @@ from jaxnav.cli.console import make_result_console, print_table, run_command
 from jaxnav.errors import InputError
 from jaxnav.plain_console import PlainConsole
 
-SETTINGS = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs", "jax_enable_compilation_cache")
+#: Settings of JAX that commands or tests change; they are restored after each test.
+CACHE_SETTINGS = (
+    "jax_compilation_cache_dir",
+    "jax_persistent_cache_min_compile_time_secs",
+    "jax_enable_compilation_cache",
+)
 
 
 @pytest.fixture(autouse=True)
 def home(tmp_path, monkeypatch):
-    """A home of one's own, and JAX as it is where nobody has told it of a cache."""
+    """An empty home folder, and JAX without a folder for compiled programs; its settings are restored at the end."""
     monkeypatch.setenv("HOME", str(tmp_path))
-    settings_before = {name: jax.config.values[name] for name in SETTINGS}
+    settings_before = {name: jax.config.values[name] for name in CACHE_SETTINGS}
     jax.config.update("jax_compilation_cache_dir", None)
     yield tmp_path
     for name, value in settings_before.items():
@@ -30,7 +35,7 @@ def home(tmp_path, monkeypatch):
 
 
 def cache_folder_of_command():
-    """The folder for compiled programs that JAX has while a command runs."""
+    """Folder in which JAX keeps compiled programs while a command runs."""
     cache_folders = []
     assert run_command(lambda _: cache_folders.append(jax.config.values["jax_compilation_cache_dir"])) == 0
     return cache_folders[0]
@@ -70,11 +75,13 @@ def test_console_reports_a_cache_folder_that_cannot_be_written(home, capsys, mon
     assert str(home / ".cache" / "jaxnav" / "xla") in capsys.readouterr().err
 
 
-def count_trims(monkeypatch, library, seconds):
-    """What `malloc_trim` of a C library is called with after a compilation of so many seconds."""
+def record_trims(monkeypatch, function_names, seconds):
+    """Arguments of all calls of `malloc_trim` after a compilation, for a C library with the named functions."""
     trim_calls = []
-    functions = dict.fromkeys(library, trim_calls.append)
-    monkeypatch.setattr(ctypes, "CDLL", lambda _: SimpleNamespace(**functions))
+    c_functions = dict.fromkeys(function_names, trim_calls.append)
+    monkeypatch.setattr(ctypes, "CDLL", lambda _: SimpleNamespace(**c_functions))
+
+    # Report a compilation and another event of the given duration to the listeners of the console.
     listeners = []
     monkeypatch.setattr(jax.monitoring, "register_event_duration_secs_listener", listeners.append)
     console._trim_memory_after_compiling.__wrapped__()
@@ -86,11 +93,11 @@ def count_trims(monkeypatch, library, seconds):
 
 @pytest.mark.parametrize(("seconds", "expected"), [(2.0, [0]), (0.1, [])])
 def test_long_compilation_trims_the_heap(monkeypatch, seconds, expected):
-    assert count_trims(monkeypatch, ["malloc_trim"], seconds) == expected
+    assert record_trims(monkeypatch, ["malloc_trim"], seconds) == expected
 
 
 def test_heap_is_not_trimmed_without_glibc(monkeypatch):
-    assert count_trims(monkeypatch, [], 2.0) == []
+    assert record_trims(monkeypatch, [], 2.0) == []
 
 
 def test_jax_reports_compilations_to_listeners(monkeypatch):

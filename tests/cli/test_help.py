@@ -1,4 +1,4 @@
-"""The help of all commands: quick, complete, with the defaults of the chosen world, and as wide as the terminal."""
+"""The help of all commands is quick and complete, shows the world's defaults, and is as wide as the terminal."""
 
 import dataclasses
 import os
@@ -31,25 +31,25 @@ def read_help(capsys, *words: str) -> str:
     return re.sub(r"[│\s]+", " ", capsys.readouterr().out)
 
 
-def run_alone(*words: str, columns: str | None = None) -> str:
-    """Return the output of a command in a process of its own."""
+def run_in_new_process(*words: str, columns: str | None = None) -> str:
+    """Return the output of a command that runs in a new process."""
     environment = os.environ | ({} if columns is None else {"COLUMNS": columns})
     command = [sys.executable, "-m", "jaxnav", *words]
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=60).stdout
 
 
-def option_types(types: dict[str, typing.Any]) -> list[type]:
-    """Return the dataclasses of all options, with those inside them."""
-    kinds: list[type] = []
-    queue = list(types.values())
+def collect_option_types(command_types: dict[str, typing.Any]) -> list[type]:
+    """Return the dataclasses of the options of all commands, nested ones included."""
+    option_types: list[type] = []
+    queue = list(command_types.values())
     while queue:
-        kind = queue.pop()
-        if isinstance(kind, dict):
-            queue += kind.values()
-        elif dataclasses.is_dataclass(kind) and kind not in kinds:
-            kinds.append(typing.cast(type, kind))
-            queue += typing.get_type_hints(kind).values()
-    return kinds
+        candidate = queue.pop()
+        if isinstance(candidate, dict):  # a command with further commands
+            queue += candidate.values()
+        elif dataclasses.is_dataclass(candidate) and candidate not in option_types:
+            option_types.append(typing.cast(type, candidate))
+            queue += typing.get_type_hints(candidate).values()
+    return option_types
 
 
 # Speed
@@ -59,7 +59,11 @@ def test_help_of_every_command_imports_no_slow_package():
     code = """
 import sys
 from jaxnav.__main__ import COMMANDS, main
-for words in [["help"], *([name, "--help"] for name in COMMANDS), ["scenes", "import", "--help"], ["train", "--sead"]]:
+command_lines = [["help"]]
+for name in COMMANDS:
+    command_lines.append([name, "--help"])
+command_lines += [["scenes", "import", "--help"], ["train", "--sead"]]
+for words in command_lines:
     try:
         main(words)
     except SystemExit:
@@ -73,13 +77,15 @@ print([name for name in sys.argv[1:] if name in sys.modules], file=sys.stderr)
 # Descriptions
 
 
-@pytest.mark.parametrize("kind", option_types(list_command_types()), ids=lambda kind: kind.__name__)
-def test_every_option_has_a_description(kind):
-    if kind.__name__ in ("Options", "ExperimentOptions"):
+@pytest.mark.parametrize(
+    "option_type", collect_option_types(list_command_types()), ids=lambda option_type: option_type.__name__
+)
+def test_every_option_has_a_description(option_type):
+    if option_type.__name__ in ("Options", "ExperimentOptions"):
         return
-    descriptions = _read_attribute_docs(kind)
-    for field in dataclasses.fields(kind):
-        is_group = dataclasses.is_dataclass(typing.get_type_hints(kind)[field.name])
+    descriptions = _read_attribute_docs(option_type)
+    for field in dataclasses.fields(option_type):
+        is_group = dataclasses.is_dataclass(typing.get_type_hints(option_type)[field.name])
         assert is_group or field.name in descriptions
         assert not FRAGMENT.match(descriptions.get(field.name, ""))
 
@@ -88,6 +94,8 @@ def test_help_lists_every_command_and_describes_one(capsys):
     text = read_help(capsys)
     for name, summary in COMMANDS.items():
         assert f" {name} {summary} " in text
+
+    # `help` lists the commands, and takes the name of one.
     assert main(["help"]) == 0
     with pytest.raises(SystemExit, match="0"):
         main(["help", "log"])
@@ -124,7 +132,7 @@ def test_train_help_shows_the_values_of_a_config(tmp_path, capsys):
 
 
 def test_help_leaves_the_settings_of_a_run_as_they_are(tmp_path):
-    # Filled-in defaults would make a run of another world, and other files.
+    # A run with the defaults filled in would count as a run of another world, with other files.
     assert fill_world_defaults(RunConfig()) != RunConfig()
     assert RunConfig().worlds.num_train is None
 
@@ -138,10 +146,10 @@ def test_study_help_shows_the_settings_of_the_experiment(capsys):
 # Width
 
 
-@pytest.mark.parametrize(("columns", "widest"), [("1", 40), ("5", 40), ("60", 60), ("500", 100)])
-def test_help_has_the_width_of_the_terminal_within_limits(columns, widest):
-    lines = run_alone("train", "--help", columns=columns).splitlines()
-    assert max(map(len, lines)) == widest
+@pytest.mark.parametrize(("columns", "max_width"), [("1", 40), ("5", 40), ("60", 60), ("500", 100)])
+def test_help_has_the_width_of_the_terminal_within_limits(columns, max_width):
+    lines = run_in_new_process("train", "--help", columns=columns).splitlines()
+    assert max(map(len, lines)) == max_width
 
 
 def test_help_on_a_terminal_without_unicode_is_readable():

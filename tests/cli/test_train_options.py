@@ -1,4 +1,4 @@
-"""The options of the train command: renamed ones, those of the method, the help."""
+"""The options of the train command: renamed options, options of the method, configurations and the help."""
 
 import dataclasses
 import re
@@ -32,7 +32,7 @@ def test_renamed_option_keeps_its_nested_group():
 
 
 @pytest.mark.parametrize(
-    ("file", "options", "expected"),
+    ("config_text", "options", "expected"),
     [
         ("", ["--method-sizes", "relation_layers", "2"], {"relation_layers": 2}),
         ("method_sizes: {relation_layers: 3}", [], {"relation_layers": 3}),
@@ -45,45 +45,49 @@ def test_renamed_option_keeps_its_nested_group():
         ("method_sizes: {relation_layers: 3}", ["--method-sizes"], {}),
     ],
 )
-def test_method_sizes_option_replaces_or_extends_the_config(tmp_path, file, options, expected):
+def test_method_sizes_option_replaces_or_extends_the_config(tmp_path, config_text, options, expected):
     path = tmp_path / "config.yaml"
-    path.write_text(file)
-    assert parse_config(RunConfig(), ["--config", str(path), *options], "train.py", "").method_sizes == expected
+    path.write_text(config_text)
+    config = parse_config(RunConfig(), ["--config", str(path), *options], "train.py", "")
+    assert config.method_sizes == expected
 
 
 def test_train_help_names_every_setting(capsys):
-    with pytest.raises(SystemExit) as exit:
+    with pytest.raises(SystemExit) as exit_info:
         train_command.main(["--help"])
-    assert exit.value.code == 0
+    assert exit_info.value.code == 0
     text = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
-    for words in ("--method STR ", "--method-sizes [NAME INT ...]", "--config NAME|FILE.yaml "):
-        assert words in text
+    for option_help in ("--method STR ", "--method-sizes [NAME INT ...]", "--config NAME|FILE.yaml "):
+        assert option_help in text
     for field in dataclasses.fields(RunConfig):
         assert f"--{field.name.replace('_', '-')}" in text
 
 
 def test_train_lists_the_packaged_configs_for_a_missing_one(tmp_path, capsys):
-    for missing in (tmp_path / "none.yaml", "smoek"):
-        assert train(missing, tmp_path / "run") == 2
-        remedy = f"give {', '.join(PRESETS)} or a file"
-        assert refusal(capsys) == f"error: {missing}: no such configuration; {remedy}"
+    remedy = f"give {', '.join(PRESETS)} or a file"
+    for missing_config in (tmp_path / "none.yaml", "smoek"):
+        assert train(missing_config, tmp_path / "run") == 2
+        assert refusal(capsys) == f"error: {missing_config}: no such configuration; {remedy}"
     assert not (tmp_path / "run").exists()
 
 
 def test_config_option_accepts_a_packaged_name_or_a_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "smoke").write_text("seeds: 4")  # the name goes first
-
-    def seeds(config):
-        return parse_config(RunConfig(), ["--config", config], "train.py", "").seeds
-
+    (tmp_path / "smoke").write_text("seeds: 4")
     assert list(CONFIGS) == PRESETS
-    assert (seeds("smoke"), seeds("./smoke"), seeds(str(CONFIGS["smoke"]))) == (1, 4, 1)
+
+    def parse_seeds(config_option):
+        return parse_config(RunConfig(), ["--config", config_option], "train.py", "").seeds
+
+    # A packaged name takes precedence over a file; a path with a folder is always a file.
+    assert parse_seeds("smoke") == 1
+    assert parse_seeds("./smoke") == 4
+    assert parse_seeds(str(CONFIGS["smoke"])) == 1
 
 
 def test_example_config_is_valid():
-    (example,) = (Path(__file__).parents[2] / "configs").glob("*.yaml")
-    config = check_config(apply_yaml(RunConfig(), example))
+    (example_path,) = (Path(__file__).parents[2] / "configs").glob("*.yaml")
+    config = check_config(apply_yaml(RunConfig(), example_path))
     assert config.seeds == 5
     assert config not in (RunConfig(), apply_yaml(RunConfig(), "smoke"))
 
@@ -106,24 +110,24 @@ def test_command_help_lists_the_packaged_configurations(capsys, command, first_n
     ],
 )
 def test_script_help_names_the_script(monkeypatch, capsys, script, usage):
-    monkeypatch.setattr("sys.argv", [*script.split(), "--help"])
+    monkeypatch.setattr("sys.argv", [script, "--help"])
     with pytest.raises(SystemExit, match="0"):
-        runpy.run_path(str(Path(__file__).parents[2] / script.split()[0]), run_name="__main__")
+        runpy.run_path(str(Path(__file__).parents[2] / script), run_name="__main__")
     assert capsys.readouterr().out.startswith(usage)
 
 
 @pytest.mark.parametrize("value", [["nonsense"], ["relation_layers"], ["relation_layers", "two"]])
 def test_method_sizes_option_refuses_values_without_integers(tmp_path, capsys, value):
-    with pytest.raises(SystemExit) as exit:
+    with pytest.raises(SystemExit) as exit_info:
         train_command.main(["--run-dir", str(tmp_path / "run"), "--method-sizes", *value])
-    assert exit.value.code == 2
+    assert exit_info.value.code == 2
     assert "--method-sizes" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("option", ["--ppo.gamma", "--seeds", "--layout.setting"])
 def test_train_names_options_of_wrong_type(tmp_path, capsys, option):
-    with pytest.raises(SystemExit) as exit:
+    with pytest.raises(SystemExit) as exit_info:
         train_command.main(["--run-dir", str(tmp_path / "run"), option, "nonsense"])
-    assert exit.value.code == 2
+    assert exit_info.value.code == 2
     assert option in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

@@ -1,4 +1,4 @@
-"""Unknown commands and options, and those of earlier versions: one line that names what to type instead."""
+"""Unknown and former commands and options, and bad values, are refused in one line that says how to go on."""
 
 import pytest
 

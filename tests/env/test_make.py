@@ -1,4 +1,4 @@
-"""Environments by the name of a world or file."""
+"""`jaxnav.make` builds environments from the name of a world or from a scene file."""
 
 import dataclasses
 from typing import Any
@@ -117,6 +117,7 @@ def test_make_shifts_layouts_by_size_or_by_context(tmp_path):
 def test_make_refuses_invalid_arguments(tmp_path, arguments, problem):
     path = tmp_path / "train.jsonl.gz"
     write_scenes(path, [generate_room("train", 0, 0)])
+    # The scene file comes between split and task; the default split is the one of the file.
     world, *split_and_task = arguments
     split, *task = split_and_task or ["train"]
     with pytest.raises(InputError, match=problem):

@@ -1,4 +1,4 @@
-"""Observations hold no bit that says whether Done would succeed."""
+"""No bit of an observation reveals whether Done would succeed."""
 
 import functools
 
@@ -23,6 +23,7 @@ all_worlds = pytest.mark.parametrize(
 
 @functools.cache
 def build_world(world: str) -> tuple[Bank, ObjectNav, EnvParams]:
+    """Tables of generated training scenes, and an environment with them."""
     scenes = make_generated_scenes(world, "train", NUM_SCENES[world])
     bank = compile_bank([scenes[index] for index in range(len(scenes))], WORLDS[world].task)
     env, params = build_environment(bank, {}, 10)
@@ -51,7 +52,7 @@ def test_find_leaks_flags_success_bits_planted_in_the_rows(world):
     leaky_rows[:, -num_bytes:] = success_bits
     leaky_params = params.replace(tables=params.tables.replace(rows=jnp.asarray(leaky_rows)))
 
-    # The bits are found in both observations of a step, and no other bit is.
+    # Exactly these bits are flagged, in both observations of a step.
     leaks = find_leaks(env, leaky_params, bank)
     first_bit = 8 * (leaky_rows.shape[1] - num_bytes)
     expected_bits = set()

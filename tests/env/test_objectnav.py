@@ -1,4 +1,4 @@
-"""One episode: its start, its steps and its end."""
+"""The start, the steps and the end of an episode."""
 
 import dataclasses
 
@@ -74,14 +74,14 @@ def test_final_observation_is_of_the_episode_that_ends():
     np.testing.assert_array_equal(final_observation.goal, states.goal)
     np.testing.assert_array_equal(final_observation.row, BANK.rows[final_state.pose])
 
-    # The new episodes are drawn anew, and observed as such.
+    # The next state and observation are those of a new episode.
     assert (np.asarray(next_states.scene) != states.scene).mean() > 0.5
     np.testing.assert_array_equal(observation.row, BANK.rows[next_states.pose])
     np.testing.assert_array_equal(observation.goal, next_states.goal)
 
 
 def is_uniform(values, choices):
-    """Whether a chi-squared test takes values, all of them in the sorted choices, for uniform."""
+    """True where a chi-squared test accepts values, which must be among the sorted choices, as uniform."""
     assert np.isin(values, choices).all()
     counts = np.bincount(np.searchsorted(choices, values), minlength=len(choices))
     return chisquare(counts).pvalue > 1e-3
@@ -117,10 +117,11 @@ def test_reset_draws_scene_goal_and_pose_uniformly(rules):
     assert is_uniform(pose[scene == 1], start_poses[4 * rules.headings :])
 
 
-# A corridor of 8 cells along z; the book's centre is at z = 2.75, its footprint from 2.5 m on (sight: 2.75 - z to
-# the centre, walk: 2.5 - z to the footprint). Each MoveAhead is 0.25 m, whatever is measured.
+#: A corridor of 8 cells along z. The centre of the book is at z = 2.75 m, and its footprint begins at z = 2.5 m.
+#: By the rules of rooms the goal distance is the distance of sight to the centre, 2.75 - z; by the rules of houses it
+#: is the length of a walk to the footprint, 2.5 - z. A MoveAhead changes either distance by 0.25 m.
 CORRIDOR = draw(["."] * 8, ("Book", 0, 1.0, 2.75, 0.5, 0.5, 0.5))
-both_measures = pytest.mark.parametrize("rules", [ROOMS, pytest.param(HOUSES, marks=pytest.mark.slow)])
+each_distance_measure = pytest.mark.parametrize("rules", [ROOMS, pytest.param(HOUSES, marks=pytest.mark.slow)])
 
 
 def corridor_with_shaping(rules, shaping):
@@ -131,14 +132,15 @@ def corridor_with_shaping(rules, shaping):
     return bank, env, params, State(pose=pose, scene=jnp.int32(0), goal=jnp.int32(BOOK), time=jnp.int32(0))
 
 
-@both_measures
+@each_distance_measure
 def test_shaping_pays_for_metres_nearer_than_ever_before(rules):
     bank, env, params, north_state = corridor_with_shaping(rules, shaping=2.0)
     half_turn = rules.headings // 2 * len(rules.horizons)
     south_state = north_state.replace(pose=north_state.pose + half_turn)
     start_distance = bank.goal_distance[3, BOOK]
 
-    # Walking away pays nothing, nor does the way back to where the agent was nearer.
+    # Metres are paid only where the agent gets nearer to the goal than ever before: a step away pays nothing, nor does
+    # the way back.
     for state, action, metres in [
         (north_state, MOVE_AHEAD, 0.25),
         (south_state, MOVE_AHEAD, 0.0),
@@ -155,15 +157,15 @@ def test_shaping_pays_for_metres_nearer_than_ever_before(rules):
             assert state_after.min_goal_distance == pytest.approx(min_distance - metres_paid, abs=1e-6)
 
 
-@both_measures
-def test_reset_starts_the_shortest_goal_distance_at_the_pose(rules):
+@each_distance_measure
+def test_reset_sets_the_minimum_goal_distance_to_that_of_the_start(rules):
     bank, env, params, _ = corridor_with_shaping(rules, shaping=2.0)
     _, state = env.reset(jax.random.key(0), params)
     assert state.min_goal_distance == pytest.approx(bank.goal_distance[env.cell_of_pose(state.pose), BOOK])
 
 
 @pytest.mark.parametrize(("rules", "goal_distance"), [(ROOMS, 1.0), pytest.param(HOUSES, 0.75, marks=pytest.mark.slow)])
-def test_shaping_leaves_the_reward_of_done(rules, goal_distance):
+def test_shaping_does_not_change_the_reward_of_done(rules, goal_distance):
     bank, env, params, start_state = corridor_with_shaping(rules, shaping=2.0)
     np.testing.assert_allclose(bank.goal_distance[7, BOOK], goal_distance)  # z = 1.75
     last_pose = jnp.int32(7 * rules.poses_per_cell)
@@ -173,7 +175,7 @@ def test_shaping_leaves_the_reward_of_done(rules, goal_distance):
 
 
 @pytest.mark.slow
-@both_measures
+@each_distance_measure
 def test_without_shaping_a_step_nearer_pays_nothing(rules):
     _, env, params, state = corridor_with_shaping(rules, shaping=0.0)
     _, reward, _, _ = env.advance(state, jnp.int32(MOVE_AHEAD), params)
@@ -211,7 +213,7 @@ def test_build_environment_never_cuts_tables_off():
 
 @pytest.mark.parametrize("num_scenes", [0, 6])
 def test_scenes_are_equally_likely_in_a_padded_bank_too(num_scenes):
-    """The bank has four scenes; padded to six it repeats the first two, which would be drawn twice as often."""
+    """A bank of four scenes that is padded to six repeats the first two, which must not be drawn twice as often."""
     env, params = build_environment(BANK, {}, 9, num_scenes=num_scenes)
     states = start_episodes(env, params, 4000)
     assert chisquare(np.bincount(states.scene, minlength=4)).pvalue > 0.001
@@ -219,7 +221,7 @@ def test_scenes_are_equally_likely_in_a_padded_bank_too(num_scenes):
 
 @pytest.mark.parametrize("share", [0.25, 1.0])
 def test_near_starts_take_the_nearest_of_several_candidates(share):
-    """Of C cells the nearest: its distance is at most x with probability 1 - (1 - F(x))^C, F that of one cell."""
+    """The nearest of C cells is at most x away with probability 1 - (1 - F(x))^C, and a single cell with F(x)."""
     env, params = build_environment(BANK, {}, 10)
     near_env = dataclasses.replace(env, near_starts=share)
 
@@ -236,7 +238,7 @@ def test_near_starts_take_the_nearest_of_several_candidates(share):
     assert (near_distances <= distances).all()
     assert (near_distances < distances).any()
 
-    # Compare the distributions in the most frequent pair of scene and goal, so that F is of its cells.
+    # Compare the distributions in the most frequent pair of scene and goal, so that F is the distribution of its cells.
     pair_index = np.asarray(states.scene) * 100 + np.asarray(states.goal)
     in_pair = pair_index == np.bincount(pair_index).argmax()
     pair_distances = distances[in_pair]
@@ -250,7 +252,7 @@ def test_near_starts_take_the_nearest_of_several_candidates(share):
 
 @pytest.mark.parametrize("action", [ROTATE_LEFT, DONE])
 def test_step_takes_a_python_number_as_action(action):
-    """Also outside of `jax.jit`, as wrappers of other libraries call it."""
+    """Wrappers of other libraries call `step` outside of `jax.jit`, with plain numbers."""
     env, params = build_environment(ONE_CELL, {}, 9)
     number_result = env.step(jax.random.key(0), state_in_one_cell(), action, params)
     array_result = env.step(jax.random.key(0), state_in_one_cell(), jnp.int32(action), params)

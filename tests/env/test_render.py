@@ -1,4 +1,4 @@
-"""Pictures of episodes as pixels and text."""
+"""Pictures of episodes as pixels, as text and in Gymnasium."""
 
 import dataclasses
 import importlib.util
@@ -25,59 +25,65 @@ BOOK = ENV.categories.index("Book")
 
 
 def state_at(cell, heading=0, scene=0):
-    """State in the kitchen that looks for a book."""
+    """State of an agent in the kitchen that searches for a book."""
     pose = ENV.task.rules.join_pose(cell, heading, 0)
     return State(pose=jnp.int32(pose), scene=jnp.int32(scene), goal=jnp.int32(BOOK), time=jnp.int32(0))
 
 
 def pixel_of(place, image):
-    """Row and column of a place (x, z)."""
-    low, high = scene_extent(tiny.KITCHEN)
-    scale = max(image.shape[:2]) / (high - low).max()
-    return int((high[1] - place[1]) * scale), int((place[0] - low[0]) * scale)
+    """Row and column of a place (x, z) in an image of the kitchen; +z is up."""
+    low_corner, high_corner = scene_extent(tiny.KITCHEN)
+    scale = max(image.shape[:2]) / (high_corner - low_corner).max()
+    row = int((high_corner[1] - place[1]) * scale)
+    column = int((place[0] - low_corner[0]) * scale)
+    return row, column
 
 
 def color_at(image, place):
     return image[pixel_of(place, image)].tolist()
 
 
-def as_bytes(color):
+def color_bytes(color):
     return np.rint(255 * parse_color(color)).astype(int).tolist()
 
 
 def test_pixels_show_agent_and_goals_where_they_are():
     image = ENV.render(state_at(0), PARAMS, size=240)
     assert (image.dtype, max(image.shape[:2]), image.shape[2]) == (np.uint8, 240, 3)
-    # Cell 0 is the first standable one, at the origin of the grid; books stand where the tiny world has them.
+
+    # Cell 0, the first standable one, is at the origin of the grid. Every book of the kitchen is a goal.
     origin = np.array(tiny.KITCHEN.origin)
-    assert color_at(image, origin) == as_bytes(AGENT_COLOR)
+    assert color_at(image, origin) == color_bytes(AGENT_COLOR)
     for name, box in zip(tiny.KITCHEN.types, tiny.KITCHEN.boxes, strict=True):
         if name == "Book":
-            assert color_at(image, box[[0, 2]]) == as_bytes(GOAL_COLOR)
+            assert color_at(image, box[[0, 2]]) == color_bytes(GOAL_COLOR)
 
 
 def test_pixels_change_with_the_pose_and_not_the_cached_plan():
-    first = ENV.render(state_at(0), PARAMS)
-    other = ENV.render(state_at(3, heading=2), PARAMS, path=[int(state_at(0).pose)])
-    assert (first != other).any()
-    np.testing.assert_array_equal(first, ENV.render(state_at(0), PARAMS))
+    first_image = ENV.render(state_at(0), PARAMS)
+    other_image = ENV.render(state_at(3, heading=2), PARAMS, path=[int(state_at(0).pose)])
+    assert (first_image != other_image).any()
+    np.testing.assert_array_equal(first_image, ENV.render(state_at(0), PARAMS))
 
 
 def test_goals_are_found_by_their_alias():
-    # A stool counts as a chair. It stands in the cell (z, x) = (1, 2).
+    # The stool, which counts as a chair, stands in the cell (z, x) = (1, 2).
     room = draw(["...."] * 3, ("Stool", 0.5, 0.3, 0.25, *SMALL))
     task = Task(("Bed", "Chair"))
     assert goal_cells(room, task, 1).tolist() == [[1, 2]]
     assert goal_cells(room, task, 0).tolist() == []
-    pictures = [SceneRenderer(room, task).draw_text([0], 0, goal) for goal in (0, 1)]
-    assert [picture.count("★") for picture in pictures] == [1, 2]  # one is in the line below the picture
+
+    # Each text has a star in the line that explains it, and the text for Chair a second one for the stool.
+    texts = [SceneRenderer(room, task).draw_text([0], 0, goal) for goal in (0, 1)]
+    assert [text.count("★") for text in texts] == [1, 2]
 
 
 def test_text_shows_agent_path_and_goals():
     heading_right = ENV.task.rules.headings // 4
     text = ENV.render(state_at(3, heading_right), PARAMS, mode="ansi", path=[int(state_at(0).pose)])
     lines = text.splitlines()
-    # The kitchen has five rows of cells, +z up.
+
+    # One line for the goal, and one for each row of cells, +z up.
     assert lines[0] == "looking for Book (★)"
     assert len(lines) == 1 + tiny.KITCHEN.walls.shape[0]
     assert sum(line.count("→") for line in lines) == 1
@@ -123,9 +129,11 @@ def test_gymnasium_renders_the_episode(gym_env):
     gym_env.step(1)
     assert (first_frame != gym_env.render()).any()
     assert gym_env.metadata["render_modes"] == ["rgb_array", "ansi"]
-    text = gym_env.unwrapped._env.render(
-        jax.tree.map(lambda leaf: leaf[0], gym_env.unwrapped._episodes.state), gym_env.unwrapped._params, mode="ansi"
-    )
+
+    # The environment below draws the episode as text.
+    wrapper = gym_env.unwrapped
+    state = jax.tree.map(lambda leaf: leaf[0], wrapper._episodes.state)
+    text = wrapper._env.render(state, wrapper._params, mode="ansi")
     assert text.startswith("looking for ")
 
 

@@ -1,4 +1,4 @@
-"""Spaces contain what they draw and what the environment gives, and refuse everything else."""
+"""Spaces contain their samples and the environment's observations, and no other value."""
 
 import functools
 
@@ -15,15 +15,15 @@ from jaxnav.scenes.files.scene_file import write_scenes
 from jaxnav.scenes.task import DONE, NUM_ACTIONS
 
 ENV, PARAMS = tiny.world()
-BYTES = Box(3, 9, (4,), jnp.uint8)
-BOTH = Dict({"row": BYTES, "goal": Discrete(5)})
+BYTE_BOX = Box(3, 9, (4,), jnp.uint8)
+DICT_SPACE = Dict({"row": BYTE_BOX, "goal": Discrete(5)})
 
 
 def random_keys(count: int, seed: int = 0) -> jax.Array:
     return jax.random.split(jax.random.key(seed), count)
 
 
-@pytest.mark.parametrize("space", [Discrete(5), Discrete(3, (2, 2)), BYTES, Box(-2, 2, (), jnp.int32), BOTH])
+@pytest.mark.parametrize("space", [Discrete(5), Discrete(3, (2, 2)), BYTE_BOX, Box(-2, 2, (), jnp.int32), DICT_SPACE])
 def test_space_contains_its_samples(space: Space):
     samples = jax.jit(jax.vmap(space.sample))(random_keys(64))
     assert jax.jit(jax.vmap(space.contains))(samples).tolist() == [True] * 64
@@ -58,19 +58,19 @@ def test_dict_space_samples_its_entries_independently():
         (Discrete(5), jnp.zeros(2, jnp.int32)),
         (Discrete(5, (2,)), jnp.int32(0)),
         (Discrete(5, (2,)), jnp.array([0, 5])),
-        (BYTES, jnp.full(4, 2, jnp.uint8)),
-        (BYTES, jnp.full(4, 10, jnp.uint8)),
-        (BYTES, jnp.array([3, 4, 5, 10], jnp.uint8)),
-        (BYTES, jnp.full(3, 5, jnp.uint8)),
-        (BYTES, jnp.full((1, 4), 5, jnp.uint8)),
-        (BYTES, jnp.full(4, 5, jnp.int32)),
-        (BYTES, jnp.full(4, 5, jnp.float32)),
-        (BOTH, {"row": jnp.full(4, 5, jnp.uint8), "goal": jnp.int32(5)}),
-        (BOTH, {"row": jnp.full(4, 2, jnp.uint8), "goal": jnp.int32(4)}),
-        (BOTH, {"row": jnp.full(4, 5, jnp.uint8)}),
-        (BOTH, {"row": jnp.full(4, 5, jnp.uint8), "goal": jnp.int32(4), "more": jnp.int32(0)}),
-        (BOTH, Observation(row=jnp.full(4, 5, jnp.uint8), goal=jnp.int32(5))),
-        (BOTH, jnp.int32(4)),
+        (BYTE_BOX, jnp.full(4, 2, jnp.uint8)),
+        (BYTE_BOX, jnp.full(4, 10, jnp.uint8)),
+        (BYTE_BOX, jnp.array([3, 4, 5, 10], jnp.uint8)),
+        (BYTE_BOX, jnp.full(3, 5, jnp.uint8)),
+        (BYTE_BOX, jnp.full((1, 4), 5, jnp.uint8)),
+        (BYTE_BOX, jnp.full(4, 5, jnp.int32)),
+        (BYTE_BOX, jnp.full(4, 5, jnp.float32)),
+        (DICT_SPACE, {"row": jnp.full(4, 5, jnp.uint8), "goal": jnp.int32(5)}),
+        (DICT_SPACE, {"row": jnp.full(4, 2, jnp.uint8), "goal": jnp.int32(4)}),
+        (DICT_SPACE, {"row": jnp.full(4, 5, jnp.uint8)}),
+        (DICT_SPACE, {"row": jnp.full(4, 5, jnp.uint8), "goal": jnp.int32(4), "more": jnp.int32(0)}),
+        (DICT_SPACE, Observation(row=jnp.full(4, 5, jnp.uint8), goal=jnp.int32(5))),
+        (DICT_SPACE, jnp.int32(4)),
     ],
 )
 def test_space_contains_no_value_out_of_range_or_of_another_shape_or_type(space, value):
@@ -87,9 +87,9 @@ def test_discrete_space_contains_whole_numbers_of_any_type(value):
 def test_dict_space_contains_mappings_and_objects():
     row = jnp.full(4, 5, jnp.uint8)
     goal = jnp.int32(4)
-    assert bool(BOTH.contains({"row": row, "goal": goal}))
-    assert bool(BOTH.contains({"goal": goal, "row": row}))
-    assert bool(BOTH.contains(Observation(row=row, goal=goal)))
+    assert bool(DICT_SPACE.contains({"row": row, "goal": goal}))
+    assert bool(DICT_SPACE.contains({"goal": goal, "row": row}))
+    assert bool(DICT_SPACE.contains(Observation(row=row, goal=goal)))
 
 
 @pytest.mark.slow
@@ -111,7 +111,7 @@ def test_observation_space_contains_the_observations_of_reset_and_step():
         num_endings += int((terminated | truncated).sum())
     assert num_endings
 
-    # A goal that is no category is noticed in its environment alone.
+    # Only the observation whose goal is no category is rejected.
     wrong_observation = observation.replace(goal=observation.goal.at[3].set(len(tiny.CATEGORIES)))
     assert contains(wrong_observation).tolist() == [index != 3 for index in range(num_envs)]
 
@@ -143,6 +143,8 @@ def test_observation_space_has_the_shapes_and_types_of_observations():
 def test_environment_has_the_interface_of_gymnax():
     key = jax.random.key(0)
     observation, state = ENV.reset(key, PARAMS)
+
+    # A step has six results, of fixed structures and types.
     results = ENV.step(key, state, ENV.action_space(PARAMS).sample(key), PARAMS)
     assert len(results) == 6
     next_observation, next_state, reward, terminated, truncated, info = results
@@ -150,6 +152,8 @@ def test_environment_has_the_interface_of_gymnax():
     assert jax.tree.structure(next_state) == jax.tree.structure(state)
     assert [value.dtype for value in (reward, terminated, truncated)] == [jnp.float32, jnp.bool_, jnp.bool_]
     assert isinstance(info, dict)
+
+    # Environments of gymnax also have a name and a number of actions.
     assert ENV.name == "ObjectNav"
     assert ENV.num_actions == ENV.action_space(PARAMS).n
 

@@ -1,4 +1,4 @@
-"""A game by scripted keys is the environment's episode, and shows what an agent perceives."""
+"""A game played by scripted keys follows the rules of the environment, and shows an agent's belief and advice."""
 
 import itertools
 from pathlib import Path
@@ -43,14 +43,14 @@ def start_longest_game(policy=None):
 
 
 def play_keys(game, keys):
-    """The result of a game, and the views that were shown before each action."""
+    """Result of a game, and the view before each action."""
     views = []
     result = play_game(game, keys, views.append)
     return result, views
 
 
 def poses_along(game, keys):
-    """The poses to which keys lead, by the tables alone."""
+    """Poses to which keys lead according to the tables of the scenes."""
     poses = [int(game.episode.pose[0])]
     for key in keys:
         poses.append(int(tiny.BANK.successor[poses[-1], KEY_ACTIONS[key]]))
@@ -58,6 +58,7 @@ def poses_along(game, keys):
 
 
 def shortest_keys(game):
+    """Keys of a shortest path to the goal."""
     return [KEY_OF_ACTION[action] for action in oracle_actions(game.bank, game.episode)[:, 0]]
 
 
@@ -73,13 +74,13 @@ def test_play_game_finds_the_goal_by_the_keys_of_the_shortest_path():
 
 
 def test_play_game_counts_detours_and_ignores_unknown_keys():
-    # The longest episode in which two more actions are within the step limit.
+    # Choose the longest episode in which two more actions are within the step limit.
     has_time = EPISODES.best_length + 2 <= np.array(tiny.STEP_LIMITS)[EPISODES.scene]
     game = start_game(int(np.where(has_time, EPISODES.best_length, 0).argmax()))
     best_length = int(game.episode.best_length[0])
     assert best_length > 1
 
-    # Left and d undo each other; the arrow after Done comes too late.
+    # The keys `left` and `d` undo each other, `x` and `?` do nothing, and `up` comes after the end of the game.
     result, _ = play_keys(game, ["left", "x", "d", "?", *shortest_keys(game), "up"])
     assert result.ending == "found in"
     assert len(result.poses) == best_length + 3
@@ -110,7 +111,7 @@ def test_play_game_ends_at_the_step_limit():
 
 
 def test_game_views_show_the_pose_belief_and_gap_of_an_agent():
-    """The pose is that of the tables; belief and gap are those of the estimator, view by view."""
+    """The tables give the pose of each view, and the layout estimator gives its belief and gap."""
     game = start_longest_game()
     keys = ["a", "w", "f", "d"]
     result, views = play_keys(game, keys)
@@ -139,7 +140,7 @@ def logits_and_next_memories(observation, memory, **odometry):
 
 
 @pytest.mark.slow
-def test_game_advice_is_the_policys_choice_along_the_players_way():
+def test_game_advice_is_the_policys_choice_along_the_path_of_the_player():
     game = start_longest_game(POLICY)
     keys = ["w", "a", "f", "d", "w"]
     result, views = play_keys(game, keys)
@@ -152,6 +153,8 @@ def test_game_advice_is_the_policys_choice_along_the_players_way():
         odometry = {"heading": pose // 2 % 8, "moved": moved, "horizon": pose % 2}
         logits, next_memories = logits_and_next_memories(observation, memory, **odometry)
         np.testing.assert_allclose(view.advice, jax.nn.softmax(logits), 1e-5)
+
+        # The player's action, not the policy's choice, decides what comes next.
         if time < len(keys):
             memory = next_memories[KEY_ACTIONS[keys[time]]]
             moved = pose // tiny.POSES_PER_CELL != result.poses[time + 1] // tiny.POSES_PER_CELL

@@ -1,4 +1,4 @@
-"""Updates of the masked members of a batch, against updates of all members."""
+"""Updates of the masked members of a batch equal updates of all members that are undone outside the mask."""
 
 import functools
 
@@ -13,13 +13,13 @@ from jaxnav.numerics.sparse import update_where
 
 
 def cubic_update(weight, inputs, state):
-    """The next state of some members: a number and a vector that depend on weight, input and state."""
+    """Next state of some members: a number and a vector that depend on weight, input and state."""
     cubes = inputs["a"] ** 3
     return {"sum": weight * cubes.sum(axis=-1) * state["sum"], "rows": weight * cubes + state["rows"]}
 
 
 def random_batch(seed, *shape):
-    """Inputs of members in `shape`, with a count that no gradient reaches, and their states."""
+    """Inputs and states of a batch of a shape; the inputs hold integers, which have no gradient."""
     rng = np.random.default_rng(seed)
     values = jnp.asarray(rng.normal(size=(*shape, 3)), jnp.float32)
     rows = jnp.asarray(rng.normal(size=(*shape, 3)), jnp.float32)
@@ -45,11 +45,12 @@ def update_all_then_restore(mask, weight, inputs, state):
 
 @functools.partial(jax.jit, static_argnums=0)
 def update_and_gradients(update, mask, inputs, state):
-    """The next state, and the gradients with respect to weight, inputs and previous state."""
+    """Next state, and the gradients of its sum of squares with respect to weight, inputs and previous state."""
 
     def loss(weight, values, state):
         next_state = update(mask, weight, inputs | {"a": values}, state)
-        return sum(jnp.square(leaf).sum() for leaf in jax.tree.leaves(next_state)), next_state
+        sum_of_squares = sum(jnp.square(leaf).sum() for leaf in jax.tree.leaves(next_state))
+        return sum_of_squares, next_state
 
     return jax.value_and_grad(loss, argnums=(0, 1, 2), has_aux=True)(2.0, inputs["a"], state)
 
@@ -76,14 +77,19 @@ def test_update_where_takes_batches_of_any_shape(shape):
         check_update_where(mask, random_batch(1, *shape))
 
 
+def take_run(tree, run_index):
+    """Arrays of one of several runs, whose index is the leading axis."""
+    return jax.tree.map(lambda leaf: leaf[run_index], tree)
+
+
 def test_update_where_under_vmap_uses_the_mask_of_each_run():
-    mask = jnp.arange(32).reshape(2, 16) > 27
+    mask = jnp.arange(32).reshape(2, 16) > 27  # no member of the first run, four of the second
     inputs, state = random_batch(2, 2, 16)
-    both_runs = jax.vmap(functools.partial(update_and_gradients, update_masked))(mask, inputs, state)
-    for run in range(2):
-        run_arguments = jax.tree.map(lambda leaf, run=run: leaf[run], (mask, inputs, state))
-        run_result = jax.tree.map(lambda leaf, run=run: leaf[run], both_runs)
-        assert_trees_close(run_result, update_and_gradients(update_all_then_restore, *run_arguments))
+    batched_result = jax.vmap(functools.partial(update_and_gradients, update_masked))(mask, inputs, state)
+    for run_index in range(2):
+        run_arguments = take_run((mask, inputs, state), run_index)
+        expected_result = update_and_gradients(update_all_then_restore, *run_arguments)
+        assert_trees_close(take_run(batched_result, run_index), expected_result)
 
 
 @pytest.mark.parametrize("count", [0, 1, 9, 16])
@@ -93,6 +99,8 @@ def test_update_where_skips_parts_without_a_masked_member(count):
     inputs, state = random_batch(0, 16)
     broken_inputs = {**inputs, "a": jnp.where(mask[:, None], inputs["a"], jnp.nan)}
     _, (_, input_gradient, _) = update_and_gradients(update_masked, mask, broken_inputs, state)
+
+    # With an odd count one unmasked member shares its part with a masked one, and is computed with it.
     is_broken = np.isnan(input_gradient).any(axis=-1)
     assert not is_broken[np.asarray(mask)].any()
     assert is_broken.sum() == count % 2
