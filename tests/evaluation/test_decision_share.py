@@ -1,4 +1,4 @@
-"""Decision shares: closed forms, policies that provably use or ignore a part, and replacement by oneself."""
+"""Decision shares: closed forms, policies that provably use or ignore a part, and replacements without effect."""
 
 import math
 
@@ -28,26 +28,26 @@ KEY = jax.random.key(3)
 
 
 def stack_params(change):
-    """A baseline and a layout policy, after a change of their parameters."""
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(change(tiny.random_params(seed)) for seed in (5, 6)))
+    """Stacked parameters of a baseline and a layout policy, after a change of their parameters."""
+    changed_params = [change(tiny.random_params(seed)) for seed in (5, 6)]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *changed_params)
 
 
 def scale_inputs(params, scale_by_input):
     """Scale the kernel rows of `fuse` by input: scene, goal, experience, action."""
-    policy = AGENT_LOOP.bind(params)
-    scales = np.repeat(
-        [scale_by_input.get(name, 1.0) for name in ("scene", "goal", "experience", "action")], policy.widths
-    )
-    fuse = params["fuse"] | {"kernel": params["fuse"]["kernel"] * jnp.asarray(scales, jnp.float32)[:, None]}
-    return params | {"fuse": fuse}
+    input_scales = [scale_by_input.get(name, 1.0) for name in ("scene", "goal", "experience", "action")]
+    row_scales = np.repeat(input_scales, AGENT_LOOP.bind(params).widths)
+    kernel = params["fuse"]["kernel"] * jnp.asarray(row_scales, jnp.float32)[:, None]
+    return params | {"fuse": params["fuse"] | {"kernel": kernel}}
 
 
 def ignore_experience(params):
+    """Parameters of a policy that does not read Z."""
     return scale_inputs(params, {"experience": 0.0})
 
 
 def use_only_experience(params):
-    """Decide from Z and its past alone: neither direct pathway nor previous action enters."""
+    """Parameters of a policy that reads only Z and its memory, neither direct pathways nor previous actions."""
     params = scale_inputs(params, {"scene": 0.0, "goal": 0.0, "action": 0.0, "experience": 20.0})
     actor = params["actor"] | {"kernel": 20.0 * params["actor"]["kernel"]}
     return params | {"actor": actor}
@@ -55,7 +55,7 @@ def use_only_experience(params):
 
 @pytest.fixture(scope="module")
 def probe():
-    """Shares of every part, by variant and decoding."""
+    """Function that measures the shares of every part [variants, parts], after a change of the parameters."""
     share_probe = ShareProbe(AGENT_LOOP, PARTS)
     rows = [table_row(variant, None, None, "sample") for variant in ARMS]
     grid = inference_grid(rows, ARMS, 1)
@@ -71,11 +71,12 @@ def test_a_decision_changes_if_its_best_action_does_and_kl_exceeds_the_bound():
     def changed(probs, changed_probs):
         return bool(is_changed(jnp.log(jnp.array(probs)), jnp.log(jnp.array(changed_probs))))
 
-    # KL((.6, .4) || (.4, .6)) = .2 ln 1.5 = .081; KL((.51, .49) || (.49, .51)) = .02 ln (.51 / .49) = .0008.
+    # KL((0.6, 0.4) || (0.4, 0.6)) = 0.2 ln 1.5 = 0.081 is above the bound, and
+    # KL((0.51, 0.49) || (0.49, 0.51)) = 0.02 ln (0.51 / 0.49) = 0.0008 is below the bound.
     assert math.isclose(0.2 * math.log(1.5), 0.0811, abs_tol=1e-4)
     assert changed((0.6, 0.4), (0.4, 0.6))
     assert not changed((0.51, 0.49), (0.49, 0.51))
-    # The best action stays, although KL is large.
+    # The best action does not change, although KL is large.
     assert not changed((0.98, 0.02), (0.51, 0.49))
 
 
@@ -87,22 +88,22 @@ def test_a_policy_that_ignores_experience_has_shares_of_zero(probe):
         assert (shares[:, part - 1] == 0).all()
     assert counts.deleted.sum() == 0
     assert counts.partner_differences[..., ReplacedPart.EXPERIENCE - 1].sum() == 0
-    # Negative control: the parts that the policy does read.
+    # Negative control: the policy reads scene and goal.
     assert (shares[:, ReplacedPart.SCENE_AND_GOAL - 1] > 0.05).all()
 
 
 @pytest.mark.slow
-def test_a_policy_of_experience_alone_depends_on_no_direct_pathway(probe):
+def test_a_policy_of_experience_depends_on_no_direct_pathway(probe):
     _, shares = probe(use_only_experience)
     assert (shares[:, ReplacedPart.SCENE_AND_GOAL - 1] == 0).all()
     assert (shares[:, ReplacedPart.EXPERIENCE - 1] > 0.1).all()
     assert (shares[:, ReplacedPart.OTHER_CATEGORIES - 1] > 0.05).all()
-    # The baseline has no w to replace.
+    # The baseline has no layout weights w to replace.
     assert shares[0, ReplacedPart.UNIFORM_WEIGHTS - 1] == 0
 
 
-def replaced_parts_of(agent, partner, part, layout_weights=None):
-    """Pathways and memory with a part replaced, and the factual ones, compiled."""
+def replaced_and_factual_inputs(agent, partner, part, layout_weights=None):
+    """Pathways and memory with a part of the partner, and the factual pathways and memory."""
 
     @jax.jit
     def replace(params, agent):
@@ -121,7 +122,8 @@ def replaced_parts_of(agent, partner, part, layout_weights=None):
 @pytest.mark.parametrize(
     "part", [ReplacedPart.OTHER_CATEGORIES, ReplacedPart.EXPERIENCE, ReplacedPart.SCENE_AND_GOAL, ReplacedPart.MEMORY]
 )
-def test_replacing_a_part_by_oneself_changes_nothing(part):
+def test_an_episode_as_its_own_partner_changes_nothing(part):
+    # The agents after one step.
     weights = tiny.random_params(6)
     agent = start_agent(weights, start_states(EPISODES), PARAMS)
     cell = tiny.leaves_at(inference_grid([table_row("layout", None, None, "sample")], ("layout",), 1), 0)
@@ -129,79 +131,80 @@ def test_replacing_a_part_by_oneself_changes_nothing(part):
     keys = jax.random.split(KEY, len(EPISODES.goal))
     agent, *_ = take_step(cell, weights, agent, running, keys, PARAMS)
 
-    own = jnp.arange(len(EPISODES.goal))
-    replaced, factual = replaced_parts_of(agent, own, part)
+    own_index = jnp.arange(len(EPISODES.goal))
+    replaced, factual = replaced_and_factual_inputs(agent, own_index, part)
     chex.assert_trees_all_equal(replaced, factual)
-    # Negative control: another episode.
-    replaced, factual = replaced_parts_of(agent, jnp.roll(own, 1), part)
+    # Negative control: another episode as partner.
+    replaced, factual = replaced_and_factual_inputs(agent, jnp.roll(own_index, 1), part)
     with pytest.raises(AssertionError):
         chex.assert_trees_all_equal(replaced, factual)
 
 
 def test_uniform_weights_keep_the_weight_of_the_goal():
-    """Where the weights off the goal are uniform already, their replacement changes nothing."""
+    """If the weights of all categories but the goal are uniform, their replacement changes nothing."""
     agent = start_agent(tiny.random_params(6), start_states(EPISODES), PARAMS)
-    own = jnp.arange(len(EPISODES.goal))
+    own_index = jnp.arange(len(EPISODES.goal))
     num_categories = KNOWLEDGE.layout.shape[-1]
 
     def replace_weights(goal_weight, other_weight):
         is_goal = jax.nn.one_hot(agent.state.goal, num_categories, dtype=bool)
         weights = jnp.where(is_goal, goal_weight, other_weight)
-        return replaced_parts_of(agent, own, ReplacedPart.UNIFORM_WEIGHTS, weights)
+        return replaced_and_factual_inputs(agent, own_index, ReplacedPart.UNIFORM_WEIGHTS, weights)
 
-    uniform = 1.0 / (num_categories - 1)
+    uniform_weight = 1.0 / (num_categories - 1)
     for goal_weight in (1.0, 1.3):
-        replaced, factual = replace_weights(goal_weight, uniform)
+        replaced, factual = replace_weights(goal_weight, uniform_weight)
         chex.assert_trees_all_equal(replaced, factual)
-    # Negative control: other weights off the goal.
-    replaced, factual = replace_weights(1.3, 2 * uniform)
+    # Negative control: larger weights of the other categories.
+    replaced, factual = replace_weights(1.3, 2 * uniform_weight)
     assert np.abs(replaced[0].experience - factual[0].experience).max() > 1e-3
 
 
 @pytest.mark.slow
 def test_replacements_leave_other_rows_bit_identical():
+    # The outcome of the table without replacements.
     weights = stack_params(ignore_experience)
     rows = table_rows([0.0, 0.5], ["residual"], ARMS)
     grid = inference_grid(rows, ARMS, 1)
     factual = Evaluator(AGENT_LOOP)(grid, weights, [(EPISODES, PARAMS)], KNOWLEDGE, KEY)
 
+    # Two more rows with replacements leave the rows of the table bit-identical.
     layout_row = rows.index(table_row("layout", None, None, "sample"))
-    replacements = [
-        Replacement(rows[layout_row], ReplacedPart.EXPERIENCE),
-        Replacement(rows[layout_row], ReplacedPart.SCENE_AND_GOAL),
-    ]
+    replaced_parts = (ReplacedPart.EXPERIENCE, ReplacedPart.SCENE_AND_GOAL)
+    replacements = [Replacement(rows[layout_row], part) for part in replaced_parts]
     replaced_grid = replacement_grid(replacements, ARMS, 1, max_room_episodes=6)
-    whole_grid = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), grid, replaced_grid)
-    evaluator = Evaluator(
-        AGENT_LOOP, has_controls=False, replaced_parts=(ReplacedPart.EXPERIENCE, ReplacedPart.SCENE_AND_GOAL)
-    )
-    outcome = evaluator(whole_grid, weights, [(EPISODES, PARAMS)], KNOWLEDGE, KEY)
+    joint_grid = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), grid, replaced_grid)
+    evaluator = Evaluator(AGENT_LOOP, has_controls=False, replaced_parts=replaced_parts)
+    outcome = evaluator(joint_grid, weights, [(EPISODES, PARAMS)], KNOWLEDGE, KEY)
     chex.assert_trees_all_equal(jax.tree.map(lambda leaf: leaf[: len(rows)], outcome), factual)
 
-    # These policies ignore Z, so its replacement changes no action; the direct pathways do.
-    was_run = EPISODES.room_rank < 6
-    assert was_run.sum() == 12
-    lengths = outcome.length[:, was_run]
+    # Rows with replacements run the first six episodes of each of two room types. The policies ignore Z, so its
+    # replacement changes no action; the replacement of scene and goal does.
+    has_replacement = EPISODES.room_rank < 6
+    assert has_replacement.sum() == 12
+    lengths = outcome.length[:, has_replacement]
     np.testing.assert_array_equal(lengths[-2], lengths[layout_row])
     assert (lengths[-1] != lengths[layout_row]).any()
-    assert (outcome.length[-2:, ~was_run] == 0).all()
+    assert (outcome.length[-2:, ~has_replacement] == 0).all()
 
 
 def test_share_interval_pools_decisions():
-    # Two runs of three episodes: 1 of 10 decisions, and 5 of 20.
-    decisions = np.array([[4, 4, 2], [10, 5, 5]])
-    counted = np.array([[1, 0, 0], [3, 1, 1]])
-    share = share_interval(counted, decisions, EPISODES.take(np.array([0, 1, 12])).clusters())
+    # Two runs of three episodes: 1 of 10 decisions changes in the first run, and 5 of 20 in the second run.
+    num_decisions = np.array([[4, 4, 2], [10, 5, 5]])
+    num_changed = np.array([[1, 0, 0], [3, 1, 1]])
+    share = share_interval(num_changed, num_decisions, EPISODES.take(np.array([0, 1, 12])).clusters())
     assert share.mean == pytest.approx(20.0)
     assert share.seeds == pytest.approx((10.0, 25.0))
-    # A single run has a share without an interval.
-    single_run = share_interval(counted[:1], decisions[:1], EPISODES.take(np.arange(3)).clusters())
-    assert single_run.mean == pytest.approx(10.0)
-    assert not single_run.has_bounds
-    assert math.isnan(share_interval(counted, 0 * decisions, EPISODES.take(np.arange(3)).clusters()).mean)
+
+    # A single run has a share without an interval, and without decisions the share is NaN.
+    clusters = EPISODES.take(np.arange(3)).clusters()
+    single_run_share = share_interval(num_changed[:1], num_decisions[:1], clusters)
+    assert single_run_share.mean == pytest.approx(10.0)
+    assert not single_run_share.has_bounds
+    assert math.isnan(share_interval(num_changed, 0 * num_decisions, clusters).mean)
 
 
-# Hooks of the methods
+# Replacement of other categories by the methods
 
 
 def make_features(seed, goal):
@@ -215,25 +218,31 @@ def make_features(seed, goal):
     )
 
 
-def test_hoz_takes_room_and_zones_of_the_other_episode():
-    own, other = make_features(0, goal=1), make_features(1, goal=1)
+def test_hoz_uses_room_and_zones_of_the_other_episode():
+    own_features = make_features(0, goal=1)
+    other_features = make_features(1, goal=1)
     own_reading = ZoneReading(jnp.array([1.0, 0.0]), jnp.zeros((3, 3)))
     other_reading = ZoneReading(jnp.array([0.0, 1.0]), jnp.ones((3, 3)))
-    mixed, reading = ZoneRelations.replace_other_categories(
-        object.__new__(ZoneRelations), own, own_reading, other, other_reading
+    features, reading = ZoneRelations.replace_other_categories(
+        object.__new__(ZoneRelations), own_features, own_reading, other_features, other_reading
     )
     chex.assert_trees_all_equal(reading, other_reading)
-    np.testing.assert_array_equal(mixed.table, np.stack([other.table[0], own.table[1], other.table[2]]))
-    np.testing.assert_array_equal(mixed.visible, np.stack([other.visible[0], own.visible[1], other.visible[2]]))
+    # The goal, category 1, keeps its features.
+    for name in ("table", "visible"):
+        own_values = getattr(own_features, name)
+        other_values = getattr(other_features, name)
+        expected = np.stack([other_values[0], own_values[1], other_values[2]])
+        np.testing.assert_array_equal(getattr(features, name), expected)
 
 
 def test_semexp_keeps_floor_and_goal_of_its_map():
-    own, other = make_features(0, goal=1), make_features(1, goal=1)
+    own_features = make_features(0, goal=1)
+    other_features = make_features(1, goal=1)
     # Bits of categories 0 to 2; the goal is 1.
     own_reading = MapReading(jnp.array([0b011, 0b000], jnp.uint32) | FREE_BIT, jnp.array([0.0, 1.0]))
     other_reading = MapReading(jnp.array([0b100, 0b111], jnp.uint32), jnp.array([1.0, 0.0]))
     _, reading = MappedCategories.replace_other_categories(
-        object.__new__(MappedCategories), own, own_reading, other, other_reading
+        object.__new__(MappedCategories), own_features, own_reading, other_features, other_reading
     )
     np.testing.assert_array_equal(reading.blocks, np.array([0b110, 0b101], np.uint32) | FREE_BIT)
     np.testing.assert_array_equal(reading.compass, own_reading.compass)

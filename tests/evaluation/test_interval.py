@@ -1,4 +1,4 @@
-"""Intervals: written, moved, turned, as JSON and back."""
+"""Intervals: format, negation and subtraction, and the round trip through JSON."""
 
 import json
 import math
@@ -35,7 +35,7 @@ def test_negation_and_subtraction_keep_the_bounds_in_order():
     assert interval_fields(-interval)[:3] == [-0.2, -0.4, -0.1]
     assert interval_fields(interval - 0.5)[:3] == [0.2 - 0.5, 0.1 - 0.5, 0.4 - 0.5]
     assert interval_fields(0.5 - interval)[:3] == [0.5 - 0.2, 0.5 - 0.4, 0.5 - 0.1]
-    # A difference of 0 has no sign of its own.
+    # A difference of 0 is positive zero.
     assert math.copysign(1.0, (0.5 - Interval(0.5, 0.5, 0.5)).mean) == 1.0
 
 
@@ -58,10 +58,10 @@ def test_arithmetic_adds_no_bounds(result):
     ],
 )
 def test_interval_json_round_trip_is_exact(interval, data):
-    written = interval.to_json()
-    assert written == data
-    read = Interval.from_json(json.loads(json.dumps(written, allow_nan=False)))
-    assert interval_fields(read) == pytest.approx(interval_fields(interval), nan_ok=True, rel=0, abs=0)
+    interval_json = interval.to_json()
+    assert interval_json == data
+    result = Interval.from_json(json.loads(json.dumps(interval_json, allow_nan=False)))
+    assert interval_fields(result) == pytest.approx(interval_fields(interval), nan_ok=True, rel=0, abs=0)
 
 
 @pytest.mark.parametrize(

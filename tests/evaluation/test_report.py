@@ -1,4 +1,4 @@
-"""The report: rows, differences, versions, its file."""
+"""The evaluation report: rows, differences, package versions, and the file."""
 
 import importlib.metadata
 import json
@@ -15,11 +15,11 @@ from jaxnav.evaluation import report as reports
 
 EPISODES = episodes_in([0, 1, 2, 3], best_length=np.array([1, 4, 5, 9]))
 IDENTITY = {"variant": "baseline", "method": "ORG", "world": "ithor", "split": "test"}
-SETTING = {"epsilon": None, "decoding": "argmax", "form": None}
+INFERENCE = {"epsilon": None, "decoding": "argmax", "form": None}
 
 
 def make_metrics(**changes):
-    """Two seeds, four episodes."""
+    """Metrics of two seeds in four episodes, with changes."""
     metrics = {
         "sr": np.array([[1, 1, 0, 1], [1, 0, 0, 1]], bool),
         "spl": np.array([[1.0, 0.5, 0.0, 0.5], [1.0, 0.0, 0.0, 0.2]]),
@@ -32,7 +32,7 @@ def make_metrics(**changes):
 
 
 def make_row(**changes: Any):
-    arguments: dict[str, Any] = {"metrics": make_metrics(), "episodes": EPISODES, **IDENTITY, **SETTING, **changes}
+    arguments: dict[str, Any] = {"metrics": make_metrics(), "episodes": EPISODES, **IDENTITY, **INFERENCE, **changes}
     return reports.build_row(**arguments)
 
 
@@ -47,7 +47,7 @@ def bounds_around(mean, variance, degrees):
 def test_row_has_all_keys_of_the_format():
     metrics = ["sr", "spl", "dts", "sae", "timeout", "wrong_done"]
     row = make_row()
-    assert set(row) == {*IDENTITY, *SETTING, "seeds", "episodes", *metrics, "interquartile_mean", "buckets"}
+    assert set(row) == {*IDENTITY, *INFERENCE, "seeds", "episodes", *metrics, "interquartile_mean", "buckets"}
     assert set(row["buckets"]) == {"L>=1", "L>=5"}
     assert set(row["buckets"]["L>=5"]) == {"episodes", *metrics}
     assert set(row["sr"]) == {"mean", "std", "ci95", "seeds"}
@@ -56,7 +56,7 @@ def test_row_has_all_keys_of_the_format():
 
 def test_row_is_in_percent_and_metres():
     row = make_row()
-    # Success: 3 of 4 and 2 of 4 -> 75 % and 50 %; mean 62.5, std 25 / sqrt(2) = 17.678.
+    # Success: 3 of 4 and 2 of 4 -> 75 % and 50 %; mean 62.5 %, std 25 / sqrt(2) = 17.678.
     assert row["sr"]["mean"] == pytest.approx(62.5)
     assert row["sr"]["std"] == pytest.approx(17.678, abs=1e-3)
     # SPL: 2.0 / 4 and 1.2 / 4 -> mean 40 %. DTS: 3 / 4 and 4 / 4 -> 0.875 m. SAE: 1.0 / 4 and 0.5 / 4 -> 18.75 %.
@@ -64,23 +64,28 @@ def test_row_is_in_percent_and_metres():
     assert row["dts"]["mean"] == pytest.approx(0.875)
     assert row["sae"]["mean"] == pytest.approx(18.75)
     assert row["sr"]["seeds"] == [75, 50]
-    # By scene 100, 50, 0 and 100 %, sample variance 6875 / 3, / 4; by run 312.5 / 2; what is left is 12.5 in six of
-    # eight and 37.5 in two, 3750 / 3 / 8, which is as much.
-    by_scene, by_run, crossed = 6875 / 12, 312.5 / 2, 3750 / 24
-    degrees = by_scene**2 / (by_scene**2 / 3 + by_run**2 + crossed**2 / 3)
-    assert row["sr"]["ci95"] == bounds_around(62.5, by_scene, degrees)
+
+    # Scene means are 100, 50, 0 and 100 % with the sample variance 6875 / 3, and run means have the sample variance
+    # 312.5. The residuals are 12.5 in six of eight cells and 37.5 in two cells, so their sum of squares is 3750. The
+    # crossed term is as large as the run term, and the two cancel in the variance of the mean.
+    scene_variance = 6875 / 3 / 4
+    run_variance = 312.5 / 2
+    crossed_variance = 3750 / 3 / 8
+    degrees = scene_variance**2 / (scene_variance**2 / 3 + run_variance**2 + crossed_variance**2 / 3)
+    assert row["sr"]["ci95"] == bounds_around(62.5, scene_variance, degrees)
 
 
 @pytest.mark.parametrize("variant", ["random", "oracle"])
 def test_untrained_rows_have_no_spread_over_seeds(variant):
-    # Over scenes alone, by the mean of the repetitions; they have no spread that says anything of a training.
+    # The interval is over scenes, by the mean of the repetitions, whose spread is not that of training runs.
     row = make_row(variant=variant)
     assert row["sr"] == {"mean": pytest.approx(62.5), "std": None, "ci95": bounds_around(62.5, 6875 / 12, 3)}
     assert row["seeds"] == 2
 
 
 def test_row_interval_counts_scenes_of_a_floor_plan_as_one():
-    # Three floor plans: 75 % of two scenes, 0 and 100 %. Without them 50, 83.3 and 50 %: 2 / 3 of the squares.
+    # Three floor plans: 75 % in two scenes, 0 % and 100 %. Without one of them the means are 50, 83.3 and 50 %. The
+    # variance is 2 / 3 of the sum of the squared deviations.
     names = ("FloorPlan_Train1_1", "FloorPlan_Train1_2", "FloorPlan_Train2_1", "FloorPlan_Train3_1")
     row = make_row(variant="random", episodes=EPISODES._replace(scenes=names))
     assert row["sr"]["ci95"] == bounds_around(62.5, 2 / 3 * (12.5**2 + (250 / 3 - 62.5) ** 2 + 12.5**2), 2)
@@ -116,20 +121,25 @@ def test_bad_results_are_refused(changes, message):
         make_row(**changes)
 
 
-def test_difference_is_in_points():
-    # Mean success 0.625 against 0.875: +25 points; the two seeds gain 0 and 50 points.
-    better = np.array([[1, 1, 0, 1], [1, 1, 1, 1]], bool)
-    difference = reports.build_difference(
-        "sr",
-        ("layout", make_metrics()["sr"]),
-        ("stde", better),
+def build_stde_difference(metric, stde_values):
+    """The difference between the layout row and sTDE in a metric."""
+    return reports.build_difference(
+        metric,
+        ("layout", make_metrics()[metric]),
+        ("stde", stde_values),
         epsilon=0.5,
         form="residual",
         decoding="argmax",
         episodes=EPISODES,
         same_runs=True,
     )
-    # Ties count half: run 0 has four, run 1 is better in two of four scenes.
+
+
+def test_difference_is_in_points():
+    # The mean success of 0.625 rises to 0.875, by 25 points; the two seeds gain 0 and 50 points.
+    better_success = np.array([[1, 1, 0, 1], [1, 1, 1, 1]], bool)
+    difference = build_stde_difference("sr", better_success)
+    # Ties count half: run 0 has four ties, and run 1 is better in two of four scenes.
     assert difference.pop("probability_of_improvement")["mean"] == pytest.approx((4 * 0.5 + 2 * 0.5 + 2) / 8)
     assert difference == {
         "metric": "sr",
@@ -140,37 +150,29 @@ def test_difference_is_in_points():
         "decoding": "argmax",
         "mean": pytest.approx(25),
         "std": pytest.approx(1250**0.5),
-        # By run 1250 / 2; by scene 0, 50, 50 and 0 points, 2500 / 3 / 4, as much as what is left: 1 degree of freedom.
+        # The run term is 1250 / 2. The scene gains of 0, 50, 50 and 0 points give 2500 / 3 / 4, which the crossed term
+        # cancels: 1 degree of freedom.
         "ci95": bounds_around(25, 625, 1),
         "seeds": [0, 50],
     }
 
 
 def test_shorter_distances_are_improvements():
-    shorter = np.array([[0.0, 0.4, 1.0, 0.5], [0.0, 1.0, 1.0, 0.4]])
-    difference = reports.build_difference(
-        "dts",
-        ("layout", make_metrics()["dts"]),
-        ("stde", shorter),
-        epsilon=0.5,
-        form="residual",
-        decoding="argmax",
-        episodes=EPISODES,
-        same_runs=True,
-    )
-    # Run 0: tie, shorter, shorter, tie; run 1: tie and three times shorter.
+    shorter_distances = np.array([[0.0, 0.4, 1.0, 0.5], [0.0, 1.0, 1.0, 0.4]])
+    difference = build_stde_difference("dts", shorter_distances)
+    # Run 0: tie, shorter, shorter, tie. Run 1: tie, shorter, shorter, shorter.
     assert difference["probability_of_improvement"]["mean"] == pytest.approx((3 * 0.5 + 5) / 8)
 
 
 def test_row_has_the_interquartile_mean_of_all_episodes():
-    # Success of two runs in four scenes: 0 three times and 100 five times; the middle four are 0, 100, 100 and 100.
+    # Success of two runs in four scenes is 0 % three times and 100 % five times; the middle four values are 0, 100, 100
+    # and 100 %.
     assert make_row()["interquartile_mean"]["sr"]["mean"] == pytest.approx(75.0)
 
 
-def test_written_report_is_read_back(tmp_path):
-    report = reports.build_report(
-        [make_row(), make_row(variant="stde", epsilon=0.5, form="residual")], [], ["A note."], 2, run={"method": "org"}
-    )
+def test_report_file_replaces_an_old_file_and_equals_the_report(tmp_path):
+    rows = [make_row(), make_row(variant="stde", epsilon=0.5, form="residual")]
+    report = reports.build_report(rows, [], ["A note."], 2, run={"method": "org"})
     path = tmp_path / "report.json"
     path.write_text("old")
     reports.write_report(path, report)

@@ -1,4 +1,4 @@
-"""The report's tables, for a terminal and in Markdown."""
+"""The tables of the evaluation report, for a terminal and in Markdown."""
 
 import io
 from typing import get_args
@@ -9,12 +9,12 @@ from rich.console import Console
 from jaxnav.choices import Form
 from jaxnav.evaluation import report as report_tables
 
-ROW = {"variant": "baseline", "method": "ORG", "world": "ithor", "split": "test"}
-ROW |= {"epsilon": None, "decoding": "argmax", "form": None}
+IDENTITY = {"variant": "baseline", "method": "ORG", "world": "ithor", "split": "test"}
+INFERENCE = {"epsilon": None, "decoding": "argmax", "form": None}
 
 
 def fixed_row(**changes):
-    """A row with numbers chosen by hand, for the tables."""
+    """A report row with fixed metrics, and changes."""
     metrics = {
         "sr": {"mean": 66.48, "std": 0.22, "ci95": [63.5, 69.44]},
         "spl": {"mean": 38.42, "std": 0.39, "ci95": [36.0, 40.0]},
@@ -24,7 +24,7 @@ def fixed_row(**changes):
         "sr@20": {"mean": 21.04, "std": 1.0, "ci95": [20.0, 22.0]},
         "sr@100": {"mean": 55.5, "std": 1.0, "ci95": [50.0, 60.0]},
     }
-    return ROW | metrics | changes
+    return IDENTITY | INFERENCE | metrics | changes
 
 
 def fixed_report(*rows, notes=()):
@@ -35,9 +35,12 @@ CELLS = ["66.5 [63.5, 69.4]", "38.4 [36.0, 40.0]", "0.54 [0.50, 0.60]", "21.0, 5
 
 
 def markdown_cells(report):
-    """The cells of the lines of a report's Markdown table, after the heading and the rule."""
-    lines = [line for line in report_tables.markdown_table(report).splitlines() if line.startswith("|")]
-    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines[2:]]
+    """The cells of each line of a report's Markdown table, after the heading and the rule."""
+    table_lines = [line for line in report_tables.markdown_table(report).splitlines() if line.startswith("|")]
+    rows = []
+    for line in table_lines[2:]:
+        rows.append([cell.strip() for cell in line.split("|")[1:-1]])
+    return rows
 
 
 @pytest.mark.parametrize(
@@ -87,14 +90,19 @@ def test_console_table_shows_names_as_text():
 
 def test_difference_table_has_a_line_per_comparison():
     entry = {"from": "layout", "to": "stde", "epsilon": 0.5, "form": "residual", "decoding": "argmax"}
-    values = [("sr", 25.0, [10.0, 40.0]), ("spl", -1.25, [-2.0, 0.5]), ("dts", -0.031, [-0.1, 0.0])]
-    report = {"differences": [{**entry, "metric": name, "mean": mean, "ci95": ci95} for name, mean, ci95 in values]}
+    differences = []
+    for name, mean, ci95 in [("sr", 25.0, [10.0, 40.0]), ("spl", -1.25, [-2.0, 0.5]), ("dts", -0.031, [-0.1, 0.0])]:
+        differences.append({**entry, "metric": name, "mean": mean, "ci95": ci95})
+    report = {"differences": differences}
+
+    # The three metrics share a line. Reports of earlier versions lack the probability of improvement.
     table = report_tables.difference_table(report)
     label, *cells = (str(next(iter(column.cells))) for column in table.columns)
     assert table.row_count == 1
     assert "sTDE" in label
-    # Reports of earlier versions lack the probability of improvement.
     assert cells == ["argmax", "+25.0 [+10.0, +40.0]", "-1.2 [-2.0, +0.5]", "-0.03 [-0.10, +0.00]", ""]
+
+    # The last column shows the probability of improvement in SR.
     report["differences"][0]["probability_of_improvement"] = {"mean": 0.625, "ci95": [0.5, 0.75]}
     *_, column = report_tables.difference_table(report).columns
     assert list(column.cells) == ["0.62 [0.50, 0.75]"]
@@ -107,27 +115,34 @@ def test_rows_of_different_forms_have_different_labels(variant):
 
 
 def make_share(part, share, partner_difference, cost):
-    """An entry of a report about the baseline, with values without intervals; None where nothing was measured."""
+    """A decision share of the baseline, with means without intervals; None for a value that was not measured."""
 
     def interval_json(mean):
         return None if mean is None else {"mean": mean, "ci95": None}
 
-    entry = {"variant": "baseline", "decoding": "argmax", "part": part, "share": interval_json(share)}
-    costs = None if cost is None else {"episodes": 10, "spl": interval_json(cost), "sr": interval_json(2 * cost)}
-    return entry | {"partner_difference": interval_json(partner_difference), "cost": costs}
+    cost_entry = None
+    if cost is not None:
+        cost_entry = {"episodes": 10, "spl": interval_json(cost), "sr": interval_json(2 * cost)}
+    return {
+        "variant": "baseline",
+        "decoding": "argmax",
+        "part": part,
+        "share": interval_json(share),
+        "partner_difference": interval_json(partner_difference),
+        "cost": cost_entry,
+    }
 
 
 def test_decision_shares_stand_below_the_table():
-    report = fixed_report(fixed_row()) | {
-        "decision_shares": [
-            make_share("other_categories", 3.14, 2.0, 1.5),
-            make_share("uniform_weights", 0.5, None, None),
-        ]
-    }
+    decision_shares = [
+        make_share("other_categories", 3.14, 2.0, 1.5),
+        make_share("uniform_weights", 0.5, None, None),
+    ]
+    report = fixed_report(fixed_row()) | {"decision_shares": decision_shares}
     lines = report_tables.markdown_table(report).splitlines()
     assert "| ORG (baseline) | other categories in Z | argmax | 3.1 [-] | 2.0 | +1.5 [-] | +3.0 [-] |" in lines
     assert "| ORG (baseline) | w (uniform instead) | argmax | 0.5 [-] |  |  |  |" in lines
-    assert report_tables.decision_share_table(report).row_count == 3  # with the heading of the row
+    assert report_tables.decision_share_table(report).row_count == 3  # two parts, and the heading of the agent
 
     # Without decisions, share and partner difference are undefined.
     entry = make_share("memory", 0.0, 0.0, None)

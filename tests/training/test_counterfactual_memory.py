@@ -1,4 +1,4 @@
-"""The counterfactual branch with a memory of its own: which inputs reach it, and how training unrolls it."""
+"""A counterfactual branch with its own memory: the inputs that reach this memory, and its replay in training."""
 
 import dataclasses
 import functools
@@ -20,25 +20,26 @@ from jaxnav.policies.pathways import Pathways
 from jaxnav.training import ppo
 from jaxnav.training.config import PPOConfig
 
-OWN = dataclasses.replace(tiny.SPEC, counterfactual_memory="own")
+OWN_MEMORY_SPEC = dataclasses.replace(tiny.SPEC, counterfactual_memory="own")
 NUM_STEPS = 9
 BATCH_SIZE = 16
 
 
 def random_pathways(policy, rng, num_steps=NUM_STEPS):
     """Random embeddings, leaves [T, B, ...]."""
-    scene, goal, experience = (
-        jnp.asarray(rng.normal(size=(num_steps, BATCH_SIZE, width)), jnp.float32) for width in policy.widths[:3]
-    )
+    embeddings = []
+    for width in policy.widths[:3]:
+        embeddings.append(jnp.asarray(rng.normal(size=(num_steps, BATCH_SIZE, width)), jnp.float32))
+    scene, goal, experience = embeddings
     return Pathways(scene, goal, experience, jnp.ones((num_steps, BATCH_SIZE, 1)))
 
 
-def decide_in_turn(policy, pathways, actions, start=0):
+def decide_step_by_step(policy, pathways, actions, start=0):
     """Decisions of an episode, a list of T, from pathways [T, B, ...] and actions int32 [T, B]."""
     memory = policy.initial_memory((BATCH_SIZE,))
     decisions = []
     for time in range(start, len(actions)):
-        decision = policy.decide(jax.tree.map(lambda leaf, time=time: leaf[time], pathways), memory)
+        decision = policy.decide(tiny.leaves_at(pathways, time), memory)
         decisions.append(decision)
         memory = decision.next_state(actions[time])
     return decisions
@@ -46,7 +47,7 @@ def decide_in_turn(policy, pathways, actions, start=0):
 
 @pytest.fixture(scope="module")
 def policy():
-    return bind(OWN, tiny.random_params(4))
+    return bind(OWN_MEMORY_SPEC, tiny.random_params(4))
 
 
 @pytest.fixture(scope="module")
@@ -55,45 +56,48 @@ def actions():
 
 
 @pytest.mark.slow
-def test_own_memory_equals_the_factual_one_where_scene_and_goal_are_always_zero(policy, actions):
+def test_own_memory_equals_the_factual_memory_if_scene_and_goal_are_always_zero(policy, actions):
     pathways = do(random_pathways(policy, np.random.default_rng(0)), scene=0.0, goal=0.0)
-    for decision in decide_in_turn(policy, pathways, actions):
+    for decision in decide_step_by_step(policy, pathways, actions):
         chex.assert_trees_all_equal(decision.counterfactual_hidden, decision.hidden)
 
 
-def test_own_memory_is_that_of_a_network_without_scene_and_goal_since_the_start(policy, actions):
+def test_own_memory_equals_that_of_a_network_that_never_received_scene_and_goal(policy, actions):
     pathways = random_pathways(policy, np.random.default_rng(0))
     factual_policy = bind(tiny.SPEC, tiny.random_params(4))
-    expected_decisions = decide_in_turn(factual_policy, do(pathways, scene=0.0, goal=0.0), actions)
-    for decision, expected in zip(decide_in_turn(policy, pathways, actions), expected_decisions, strict=True):
+    expected_decisions = decide_step_by_step(factual_policy, do(pathways, scene=0.0, goal=0.0), actions)
+    decisions = decide_step_by_step(policy, pathways, actions)
+    for decision, expected in zip(decisions, expected_decisions, strict=True):
         chex.assert_trees_all_equal(decision.counterfactual_hidden, expected.hidden)
         assert np.abs(decision.counterfactual_hidden - decision.hidden).max() > 0.1
 
 
 def test_only_experience_and_actions_reach_the_own_memory(policy, actions):
     rng = np.random.default_rng(0)
-    pathways, other_pathways = random_pathways(policy, rng), random_pathways(policy, rng)
-    last = decide_in_turn(policy, pathways, actions)[-1]
+    pathways = random_pathways(policy, rng)
+    other_pathways = random_pathways(policy, rng)
+    last_decision = decide_step_by_step(policy, pathways, actions)[-1]
+
+    # Another scene and goal leave the own memory as it is. Negative control: the factual memory changes.
     other_scene = do(pathways, scene=other_pathways.scene, goal=other_pathways.goal)
-    chex.assert_trees_all_equal(
-        decide_in_turn(policy, other_scene, actions)[-1].counterfactual_hidden, last.counterfactual_hidden
-    )
-    # Negative controls: the factual memory reads scene and goal, and both memories read experience and actions.
-    assert np.abs(decide_in_turn(policy, other_scene, actions)[-1].hidden - last.hidden).max() > 0.1
+    scene_decision = decide_step_by_step(policy, other_scene, actions)[-1]
+    chex.assert_trees_all_equal(scene_decision.counterfactual_hidden, last_decision.counterfactual_hidden)
+    assert np.abs(scene_decision.hidden - last_decision.hidden).max() > 0.1
+
+    # Negative controls: the own memory changes with experience and with actions.
     other_experience = do(pathways, experience=other_pathways.experience)
-    for changed in (
-        decide_in_turn(policy, other_experience, actions),
-        decide_in_turn(policy, pathways, (actions + 1) % 6),
-    ):
-        assert np.abs(changed[-1].counterfactual_hidden - last.counterfactual_hidden).max() > 0.01
+    experience_decision = decide_step_by_step(policy, other_experience, actions)[-1]
+    action_decision = decide_step_by_step(policy, pathways, (actions + 1) % 6)[-1]
+    for decision in (experience_decision, action_decision):
+        assert np.abs(decision.counterfactual_hidden - last_decision.counterfactual_hidden).max() > 0.01
 
 
-def test_policies_carry_no_second_memory_by_default():
+def test_policies_have_no_second_memory_by_default():
     factual_policy = bind(tiny.SPEC, tiny.random_params(4))
     memory = factual_policy.initial_memory((3,))
     assert memory.counterfactual_hidden is None
     assert memory.counterfactual_state() is memory
-    own_memory = bind(OWN, tiny.random_params(4)).initial_memory((3,))
+    own_memory = bind(OWN_MEMORY_SPEC, tiny.random_params(4)).initial_memory((3,))
     np.testing.assert_array_equal(own_memory.counterfactual_hidden, np.zeros((3, tiny.SIZES.hidden)))
 
 
@@ -107,7 +111,10 @@ def test_policy_spec_refuses_an_own_memory_of_two_streams():
 
 @functools.cache
 def collect_two_rollouts(method_name, counterfactual_memory="own"):
-    """The weights of a policy, and two rollouts, the second of which begins within episodes."""
+    """An agent loop, the weights of a policy, two rollouts in a row, and the agent after the second rollout.
+
+    The second rollout begins within episodes.
+    """
     spec = dataclasses.replace(
         tiny.SPEC,
         method=find_method(method_name),
@@ -131,7 +138,7 @@ def collect_two_rollouts(method_name, counterfactual_memory="own"):
 
 
 def replay_as(replay_decisions: Any, agent_loop: AgentLoop, weights: Any, rollout: Any) -> Any:
-    """Factual and counterfactual decisions by one of the two kinds of replay."""
+    """Factual and counterfactual decisions of a rollout by a replay function, parallel or step by step."""
     policy = agent_loop.bind(weights)
     observation = ppo.Observation(PARAMS.tables.rows[rollout.transitions.pose], rollout.transitions.goal)
     inputs = ppo.PolicyInputs(observation, rollout.transitions.layout_weights)
@@ -150,38 +157,41 @@ def distil_loss(decisions):
 @pytest.mark.parametrize(
     "method_name", ["org", pytest.param("support.methods:ATTENTIVE", marks=pytest.mark.exhaustive)]
 )
-def test_both_kinds_of_replay_agree_in_decisions_and_gradients(method_name, kind):
+def test_parallel_and_stepwise_replay_agree_in_decisions_and_gradients(method_name, kind):
     agent_loop, weights, rollouts, _ = collect_two_rollouts(method_name, kind)
     rollout = rollouts[1]
     assert rollout.transitions.ended[:-1].sum() > 20
-    results = []
-    for replay_decisions in (ppo._replay_in_parallel, ppo._replay_step_by_step):
+
+    def compute_gradients(replay_decisions):
+        """Gradient and logits of the distillation loss, and the gradient of a loss on the factual decisions."""
+
+        def distillation_loss(weights):
+            decisions = replay_as(replay_decisions, agent_loop, weights, rollout)
+            return distil_loss(decisions), [decision.logits for decision in decisions]
+
+        def factual_loss(weights):
+            factual, _ = replay_as(replay_decisions, agent_loop, weights, rollout)
+            return jnp.square(factual.logits).mean() + jnp.square(factual.value).mean()
 
         @jax.jit
-        def compute(weights, replay_decisions=replay_decisions):
-            def loss(weights):
-                decisions = replay_as(replay_decisions, agent_loop, weights, rollout)
-                return distil_loss(decisions), [decision.logits for decision in decisions]
+        def compute(weights):
+            return *jax.grad(distillation_loss, has_aux=True)(weights), jax.grad(factual_loss)(weights)
 
-            def factual_loss(weights):
-                factual, _ = replay_as(replay_decisions, agent_loop, weights, rollout)
-                return jnp.square(factual.logits).mean() + jnp.square(factual.value).mean()
+        return compute(weights)
 
-            return *jax.grad(loss, has_aux=True)(weights), jax.grad(factual_loss)(weights)
-
-        results.append(compute(weights))
+    results = [compute_gradients(ppo._replay_in_parallel), compute_gradients(ppo._replay_step_by_step)]
     chex.assert_trees_all_close(*results, rtol=1e-3, atol=1e-5)
 
-    # Distillation reaches nothing that only the direct pathways use.
+    # Distillation trains no parameters that only the direct pathways use.
     gradient, *_ = results[0]
-    reached = changed_parts(jax.tree.map(jnp.zeros_like, gradient), gradient)
-    assert reached >= {"method", "core", "actor", "fuse"}
-    assert not reached & {"view", "sought", "critic"}
+    trained_parts = changed_parts(jax.tree.map(jnp.zeros_like, gradient), gradient)
+    assert trained_parts >= {"method", "core", "actor", "fuse"}
+    assert not trained_parts & {"view", "sought", "critic"}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method_name", ["org", "support.methods:ATTENTIVE"])
-def test_replay_repeats_the_memory_that_acting_carries(method_name):
+def test_replay_repeats_the_memory_of_the_rollout(method_name):
     agent_loop, weights, rollouts, last_agent = collect_two_rollouts(method_name)
     memories = [rollouts[0].initial_memory, rollouts[1].initial_memory, last_agent.memory]
     for rollout, next_memory in zip(rollouts, memories[1:], strict=True):
@@ -193,14 +203,15 @@ def test_replay_repeats_the_memory_that_acting_carries(method_name):
 
 
 @pytest.mark.slow
-def test_acting_and_factual_decisions_do_not_depend_on_the_kind_of_memory():
+def test_actions_and_factual_decisions_do_not_depend_on_the_kind_of_memory():
     results = []
     for kind in ("factual", "own"):
         agent_loop, weights, rollouts, _ = collect_two_rollouts("org", kind)
         factual, counterfactual = replay_as(ppo._replay_in_parallel, agent_loop, weights, rollouts[1])
         results.append((rollouts[1].transitions, factual.logits, counterfactual.logits))
-    chex.assert_trees_all_equal(results[0][:2], results[1][:2])
-    assert np.abs(results[0][2] - results[1][2]).max() > 0.01
+    factual_kind, own_kind = results
+    chex.assert_trees_all_equal(factual_kind[:2], own_kind[:2])
+    assert np.abs(factual_kind[2] - own_kind[2]).max() > 0.01
 
 
 @pytest.mark.slow
@@ -209,8 +220,8 @@ def test_distillation_along_the_own_memory_lowers_its_divergence():
     learner = ppo.Learner(agent_loop, PPOConfig(num_envs=ENVS, rollout=LENGTH, minibatches=4), "distil")
     state = jax.jit(learner.init)(jax.random.key(0), PARAMS, KNOWLEDGE)
     scalars = learner.config.scalars(12).replace(distil_weight=jnp.float32(5.0))
-    losses = []
     update = jax.jit(learner.update)
+    losses = []
     for _ in range(12):
         state, metrics = update(state, scalars, PARAMS, KNOWLEDGE)
         losses.append(float(metrics["distil_loss"]))

@@ -1,4 +1,4 @@
-"""Guidance: the cross-entropy to a shortest path's next action, added to the loss along the policy's own rollouts."""
+"""Guidance adds to the loss the cross-entropy to the next action of a shortest path along the policy's rollouts."""
 
 import dataclasses
 
@@ -30,15 +30,15 @@ def guided_ppo(**settings):
 
 
 def loss_terms(config, env_params):
-    """The loss of a recorded rollout and its terms, by name."""
-    run = rolled(False)
-    transitions, memory = jax.tree.map(jnp.asarray, (run.transitions, run.memory))
+    """The loss of a recorded rollout, its terms by name, and the factual logits."""
+    recorded = rolled(False)
+    transitions, memory = jax.tree.map(jnp.asarray, (recorded.transitions, recorded.memory))
 
     def compute(weights):
         replay = replay_rollout(ACTING.bind(weights), transitions, memory, env_params)
         return *ppo_loss(replay, transitions.reward, config.scalars(10), False, METHOD), replay.factual.logits
 
-    return jax.tree.map(np.asarray, jax.jit(compute)(run.weights))
+    return jax.tree.map(np.asarray, jax.jit(compute)(recorded.weights))
 
 
 @pytest.mark.slow
@@ -49,47 +49,52 @@ def test_guidance_adds_the_weighted_cross_entropy_to_shortest_paths():
     # Step by step: minus the log-probability of the action that the table of shortest paths holds.
     transitions = rolled(False).transitions
     expert = tiny.BANK.expert
-    surprises = []
+    cross_entropies = []
     for time, env in np.ndindex(transitions.pose.shape):
         action = expert[transitions.pose[time, env], transitions.goal[time, env]]
         step_logits = logits[time, env].astype(np.float64)
         log_probs = step_logits - np.log(np.exp(step_logits).sum())
-        surprises.append(-log_probs[action] if action < len(log_probs) else 0.0)
-    np.testing.assert_allclose(terms["imitation_loss"], np.mean(surprises), rtol=1e-5)
-    np.testing.assert_allclose(loss, plain_loss + 0.3 * np.mean(surprises), rtol=1e-5)
+        has_action = action < len(log_probs)
+        cross_entropies.append(-log_probs[action] if has_action else 0.0)
+    np.testing.assert_allclose(terms["imitation_loss"], np.mean(cross_entropies), rtol=1e-5)
+    np.testing.assert_allclose(loss, plain_loss + 0.3 * np.mean(cross_entropies), rtol=1e-5)
     assert set(terms) - set(plain_terms) == {"imitation_loss", "imitation_agreement"}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("final_guidance", "expected"), [pytest.param(None, 0.8, marks=pytest.mark.exhaustive), (0.0, 0.6)]
+    ("final_guidance", "expected_guidance"), [pytest.param(None, 0.8, marks=pytest.mark.exhaustive), (0.0, 0.6)]
 )
-def test_guidance_goes_to_its_final_weight_within_a_stage(final_guidance, expected):
+def test_guidance_changes_to_its_final_weight_within_a_stage(final_guidance, expected_guidance):
     """Update 1 of 4: a quarter of the way from 0.8 to 0 is 0.6; without a final weight it stays 0.8."""
     config = guided_ppo(guidance=0.8, final_guidance=final_guidance, learning_rate=0.0, epochs=1, minibatches=1)
     learner = dataclasses.replace(LEARNER, config=config)
     knowledge = tiny.knowledge()
     state = learner.init(jax.random.key(0), GUIDED_PARAMS, knowledge).replace(update=jnp.int32(1))
-    plain = dataclasses.replace(LEARNER, config=dataclasses.replace(config, guidance=0.0, final_guidance=0.0))
 
-    # The learning rate is 0, so the gradients of both learners belong to the same parameters and the same rollout.
-    gradients = {}
-    for name, compared in {"guided": learner, "plain": plain, "reference": reference_learner(config, expected)}.items():
-        update = jax.jit(compared.update)
-        _, metrics = update(state, compared.config.scalars(4), GUIDED_PARAMS, knowledge)
-        gradients[name] = float(metrics["gradient_norm"])
-    assert gradients["guided"] != pytest.approx(gradients["plain"], rel=1e-3)
-    assert gradients["guided"] == pytest.approx(gradients["reference"], rel=1e-5)
+    # The learning rate is 0, so the gradients of all learners belong to the same parameters and the same rollout.
+    learners = {
+        "guided": learner,
+        "plain": constant_guidance_learner(config, 0.0),
+        "reference": constant_guidance_learner(config, expected_guidance),
+    }
+    gradient_norms = {}
+    for name, compared_learner in learners.items():
+        update = jax.jit(compared_learner.update)
+        _, metrics = update(state, compared_learner.config.scalars(4), GUIDED_PARAMS, knowledge)
+        gradient_norms[name] = float(metrics["gradient_norm"])
+    assert gradient_norms["guided"] != pytest.approx(gradient_norms["plain"], rel=1e-3)
+    assert gradient_norms["guided"] == pytest.approx(gradient_norms["reference"], rel=1e-5)
 
 
-def reference_learner(config, guidance):
-    """A learner whose guidance has one weight throughout."""
+def constant_guidance_learner(config, guidance):
+    """A learner whose guidance has a constant weight."""
     return dataclasses.replace(LEARNER, config=dataclasses.replace(config, guidance=guidance, final_guidance=guidance))
 
 
 @pytest.mark.slow
 def test_a_guided_policy_agrees_with_shortest_paths_more_often():
-    """Ten updates of the small world, with and without guidance, from the same start."""
+    """Ten updates in the small world, with and without guidance, start from equal parameters."""
     knowledge = tiny.knowledge()
     agreement = {}
     for weight in (1e-9, 3.0):  # a negligible weight still measures the agreement
@@ -105,13 +110,13 @@ def test_a_guided_policy_agrees_with_shortest_paths_more_often():
 
 @pytest.mark.parametrize("world", WORLDS)
 @pytest.mark.parametrize("method", METHODS)
-def test_the_default_weight_is_that_of_the_world_where_methods_choose_actions(world, method):
+def test_the_default_weight_is_that_of_the_world_if_the_method_chooses_actions(world, method):
     config = check_config(RunConfig(world=world, method=method, total_steps=10**7))
     assert config.ppo.guidance == (0.0 if method in ("semexp", "belief") else WORLDS[world].guidance)
     assert fill_world_defaults(RunConfig(world=world)).ppo.guidance == WORLDS[world].guidance
 
 
-def test_a_given_weight_is_kept_and_needs_shortest_paths_in_training():
+def test_an_explicit_weight_is_used_and_a_positive_weight_needs_guidance():
     config = check_config(RunConfig(ppo=PPOConfig(guidance=0.25)))
     assert config.ppo.guidance == 0.25
     assert not PPOConfig(guidance=0.0).has_guidance
@@ -128,10 +133,10 @@ def test_a_given_weight_is_kept_and_needs_shortest_paths_in_training():
     ],
 )
 def test_impossible_weights_are_refused_in_one_line(options, message):
-    with pytest.raises(InputError, match="config: ") as error:
+    with pytest.raises(InputError, match="config: ") as refusal:
         check_config(RunConfig(**options))
-    assert message in str(error.value)
-    assert "\n" not in str(error.value)
+    assert message in str(refusal.value)
+    assert "\n" not in str(refusal.value)
 
 
 @pytest.mark.parametrize("guidance", [0.0, 0.1])

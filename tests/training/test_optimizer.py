@@ -1,4 +1,4 @@
-"""One step of the optimizer, by hand: Adam's first step is the sign of the gradient, nearly."""
+"""One step of the optimizer follows worked arithmetic: Adam's first step is close to the sign of the gradient."""
 
 import dataclasses
 
@@ -10,19 +10,22 @@ from jaxnav.policies.methods import find_method
 from jaxnav.training.config import PPOConfig
 from jaxnav.training.ppo import apply_gradient, make_optimizer
 
-CONFIG, SINGLE_RATE = PPOConfig(), "jaxnav.policies.methods.vtnet:SINGLE_RATE"
+CONFIG = PPOConfig()
+SINGLE_RATE = "jaxnav.policies.methods.vtnet:SINGLE_RATE"
 WEIGHTS = {"method": {"token": jnp.float32([1.0, 2.0])}, "actor": {"bias": jnp.float32([3.0])}}
 GRADIENT = {"method": {"token": jnp.float32([0.2, -0.1])}, "actor": {"bias": jnp.float32([0.3])}}
 
 
-def step(rates, gradient=GRADIENT):
+def take_step(rates, gradient=GRADIENT):
+    """All weights after one step of the optimizer, and the number of skipped steps."""
     state = make_optimizer(CONFIG).init(WEIGHTS)
-    after, state = apply_gradient(CONFIG, WEIGHTS, state, gradient, jnp.float32(0.01), rates)
-    return np.concatenate([after["method"]["token"], after["actor"]["bias"]]), int(state.total_notfinite)
+    next_weights, state = apply_gradient(CONFIG, WEIGHTS, state, gradient, jnp.float32(0.01), rates)
+    values = np.concatenate([next_weights["method"]["token"], next_weights["actor"]["bias"]])
+    return values, int(state.total_notfinite)
 
 
-# Its norm sqrt(0.04 + 0.01 + 0.09) = 0.374 is below the clip of 0.5. The first moments over the roots of the second
-# are g / (|g| + 1e-5), within 1e-4 of 1 or -1, and the steps 0.01 times that.
+# The norm of the gradient, sqrt(0.04 + 0.01 + 0.09) = 0.374, is below the clip of 0.5. The first moments over the roots
+# of the second moments are g / (|g| + 1e-5), within 1e-4 of 1 or -1, and a step is 0.01 times this ratio.
 @pytest.mark.parametrize(
     ("rates", "expected"),
     [
@@ -32,25 +35,30 @@ def step(rates, gradient=GRADIENT):
     ],
 )
 def test_a_parameter_learns_at_its_rate(rates, expected):
-    np.testing.assert_allclose(step(rates)[0], expected, atol=2e-6)
+    np.testing.assert_allclose(take_step(rates)[0], expected, atol=2e-6)
 
 
-def test_a_gradient_of_what_does_not_move_is_no_matter():
-    broken = GRADIENT | {"actor": {"bias": jnp.float32([jnp.nan])}}
-    after, skipped = step(lambda path: path[0] == "method", broken)
-    np.testing.assert_allclose(after, [0.99, 2.01, 3.0], atol=2e-6)
-    assert skipped == 0
-    assert step(None, broken)[1] == 1
+def test_a_gradient_of_fixed_parameters_has_no_effect():
+    nan_gradient = GRADIENT | {"actor": {"bias": jnp.float32([jnp.nan])}}
+    values, num_skipped = take_step(lambda path: path[0] == "method", nan_gradient)
+    np.testing.assert_allclose(values, [0.99, 2.01, 3.0], atol=2e-6)
+    assert num_skipped == 0
+    # Negative control: if all parameters learn, the step is skipped.
+    assert take_step(None, nan_gradient)[1] == 1
 
 
-def test_vtnet_goes_on_at_a_tenth_of_the_rate_of_imitation():
-    (imitate, reinforce), (same, single_rate) = find_method("vtnet").stages, find_method(SINGLE_RATE).stages
-    assert same == imitate
-    assert single_rate == dataclasses.replace(reinforce, lr_scale_by_path=None)
-    rates = [stage.lr_scale_by_path for stage in (imitate, reinforce) if stage.lr_scale_by_path is not None]
-    assert [rate(("method", "maps", "bias")) for rate in rates] == [1, 0.1]
-    assert [rate(("actor", "bias")) for rate in rates] == [0, 1]
+def test_vtnet_continues_at_a_tenth_of_the_rate_of_imitation():
+    imitation_stage, reward_stage = find_method("vtnet").stages
+    equal_stage, single_rate_stage = find_method(SINGLE_RATE).stages
+    assert equal_stage == imitation_stage
+    assert single_rate_stage == dataclasses.replace(reward_stage, lr_scale_by_path=None)
+
+    # Imitation trains only the method; the second stage trains the method at a tenth of the rate of the rest.
+    lr_scales = [imitation_stage.lr_scale_by_path, reward_stage.lr_scale_by_path]
+    scale_functions = [lr_scale for lr_scale in lr_scales if lr_scale is not None]
+    assert [lr_scale(("method", "maps", "bias")) for lr_scale in scale_functions] == [1, 0.1]
+    assert [lr_scale(("actor", "bias")) for lr_scale in scale_functions] == [0, 1]
 
 
-def test_runs_of_the_former_name_are_those_of_the_default():
+def test_the_former_name_of_the_default_has_equal_stages():
     assert find_method("jaxnav.policies.methods.vtnet:SLOWER").stages == find_method("vtnet").stages
