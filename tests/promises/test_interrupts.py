@@ -1,6 +1,6 @@
-"""A training that is asked to end finishes its chunk, saves, and says how to go on.
+"""A training that gets SIGINT or SIGTERM finishes its chunk, saves, and prints how to continue.
 
-Seen to fail: with a handler that does not step back after the first signal, so that the second Ctrl-C ends nothing.
+Seen to fail: with a handler that stays installed after the first signal, so that the second Ctrl-C ends nothing.
 """
 
 import re
@@ -16,92 +16,106 @@ from support.tiny_run import write_config
 
 from jaxnav.cli.console import run_command
 from jaxnav.errors import Interrupted
-from jaxnav.runs import train as updates
+from jaxnav.runs import train as train_module
 from jaxnav.runs.train import Interrupts
 
-LIMIT_S = 30
-#: 60 updates; checkpoints are rare, so that the one after the signal is for the signal.
-LONG = ("--total-steps", 60 * 128, "--save-every", 7)
+TIME_LIMIT_S = 30
+#: Options for 60 updates. Checkpoints are rare, so the one after a signal was saved because of the signal.
+LONG_RUN = ("--total-steps", 60 * 128, "--save-every", 7)
 
 
 @pytest.fixture(autouse=True)
-def heeded():
-    """SIGINT as in a terminal: a shell that starts the tests in the background has it ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+def sigint_handler():
+    """Python's handler of SIGINT, as in a terminal: a shell that starts the tests in the background ignores SIGINT."""
+    old_handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
-    signal.signal(signal.SIGINT, before)
+    signal.signal(signal.SIGINT, old_handler)
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """The directory of a run that is left alone."""
+def undisturbed_dir(tmp_path_factory):
+    """Directory of a run that no signal interrupts."""
     folder = tmp_path_factory.mktemp("whole")
-    assert train(write_config(folder), folder / "run", *LONG) == 0
+    assert train(write_config(folder), folder / "run", *LONG_RUN) == 0
     return folder / "run"
 
 
 @pytest.mark.slow
-def test_interrupted_run_saves_and_resumes_bit_for_bit(whole, tmp_path, capsys):
+def test_interrupted_run_saves_and_resumes_bit_for_bit(undisturbed_dir, tmp_path, capsys):
     config_file = write_config(tmp_path)
     # A name that Orbax by itself cannot read (promise 24).
-    ended = tmp_path / "ended[1]"
-    process = run(["train.py", "--config", config_file, "--run-dir", ended, *LONG])
-    while process.poll() is None and not (ended / "metrics.jsonl").exists():
+    run_dir = tmp_path / "ended[1]"
+
+    # Interrupt the training after its first chunk.
+    process = run(["train.py", "--config", config_file, "--run-dir", run_dir, *LONG_RUN])
+    while process.poll() is None and not (run_dir / "metrics.jsonl").exists():
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
-    _, error = process.communicate(timeout=LIMIT_S)
+    _, error = process.communicate(timeout=TIME_LIMIT_S)
+
+    # The process ends with one line, and its only checkpoint is that of the update in this line.
     assert process.returncode == 130, error
-    message = error.splitlines()[-1]
     match = re.fullmatch(
-        rf"interrupted: {re.escape(str(ended))}: stopped after update (\d+) of 60 and saved; "
+        rf"interrupted: {re.escape(str(run_dir))}: stopped after update (\d+) of 60 and saved; "
         "run the same command again to continue",
-        message,
+        error.splitlines()[-1],
     )
     assert match, error
     assert "Traceback" not in error
-    assert [path.name for path in (ended / "checkpoints").iterdir()] == [match[1]]
-    assert train(config_file, ended, *LONG) == 0
-    assert f"resumed after update {match[1]} of 60" in capsys.readouterr().err
+    last_update = match[1]
+    assert [path.name for path in (run_dir / "checkpoints").iterdir()] == [last_update]
+
+    # The same command resumes, and the run ends like one without an interrupt.
+    assert train(config_file, run_dir, *LONG_RUN) == 0
+    assert f"resumed after update {last_update} of 60" in capsys.readouterr().err
     for name in ("metrics.jsonl", "policies/baseline-1/params.safetensors", "policies/layout-0/params.safetensors"):
-        assert (ended / name).read_bytes() == (whole / name).read_bytes(), name
+        assert (run_dir / name).read_bytes() == (undisturbed_dir / name).read_bytes(), name
 
 
 @pytest.mark.exhaustive
 def test_signal_to_one_process_ends_both_at_the_same_chunk(tmp_path):
-    """Both save the same chunk, end with the code of the signal, and go on together."""
+    """Both processes save the same chunk, end with the code of the signal, and resume together."""
     config_file = write_config(tmp_path)
-    ended = tmp_path / "ended"
-    address = free_address()
-    again = free_address()
-    both = [start(address, index, config_file, ended, *LONG) for index in range(2)]
-    while all(process.poll() is None for process in both) and not (ended / "metrics.jsonl").exists():
+    run_dir = tmp_path / "ended"
+    first_address = free_address()
+    second_address = free_address()
+
+    # Signal one of two processes after the first chunk.
+    processes = [start(first_address, index, config_file, run_dir, *LONG_RUN) for index in range(2)]
+    while all(process.poll() is None for process in processes) and not (run_dir / "metrics.jsonl").exists():
         time.sleep(0.02)
-    both[1].send_signal(signal.SIGTERM)
-    codes, messages = ends(*both, timeout=2 * LIMIT_S)
-    assert codes == [143, 143], messages
-    (done,) = {
-        re.findall(r"interrupted: .* stopped after update (\d+) of 60 and saved", message)[-1] for message in messages
-    }
-    assert [path.name for path in (ended / "checkpoints").iterdir()] == [done]
-    codes, messages = ends(*(start(again, index, config_file, ended, *LONG) for index in range(2)))
-    assert codes == [0, 0], messages
-    assert f"resumed after update {done} of 60" in messages[0]
+    processes[1].send_signal(signal.SIGTERM)
+    exit_codes, messages = ends(*processes, timeout=2 * TIME_LIMIT_S)
+    assert exit_codes == [143, 143], messages
+
+    # Both name the same update, which has the only checkpoint.
+    pattern = r"interrupted: .* stopped after update (\d+) of 60 and saved"
+    (last_update,) = {re.findall(pattern, message)[-1] for message in messages}
+    assert [path.name for path in (run_dir / "checkpoints").iterdir()] == [last_update]
+
+    # The same commands resume after this update.
+    processes = [start(second_address, index, config_file, run_dir, *LONG_RUN) for index in range(2)]
+    exit_codes, messages = ends(*processes)
+    assert exit_codes == [0, 0], messages
+    assert f"resumed after update {last_update} of 60" in messages[0]
 
 
 def test_interrupts_note_the_first_signal_and_restore_the_default_for_the_second():
     for number in (signal.SIGINT, signal.SIGTERM):
-        before = signal.getsignal(number)
+        old_handler = signal.getsignal(number)
         with Interrupts() as interrupts:
             assert interrupts.pending_signal() == 0
             signal.raise_signal(number)
             assert interrupts.pending_signal() == number
-            # What the system does by itself: it ends the process, wherever it is.
-            assert {signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)} == {signal.SIG_DFL}
-        assert signal.getsignal(number) == before
+
+            # The default handlers of the system are back: they end the process at once.
+            for handled_number in (signal.SIGINT, signal.SIGTERM):
+                assert signal.getsignal(handled_number) == signal.SIG_DFL
+        assert signal.getsignal(number) == old_handler
 
 
 def test_interrupts_keep_an_ignored_signal_ignored():
-    """As in a run that `nohup` or a script started in the background."""
+    """A run that `nohup` or a script starts in the background ignores SIGINT."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with Interrupts() as interrupts:
         signal.raise_signal(signal.SIGINT)
@@ -111,52 +125,53 @@ def test_interrupts_keep_an_ignored_signal_ignored():
 
 @pytest.mark.exhaustive
 def test_signal_during_the_last_save_is_reported(tmp_path, capsys, monkeypatch):
-    """The run is saved and not exported; the same command exports it."""
+    """The interrupted run is saved but not exported; the same command exports it."""
     config_file = write_config(tmp_path)
     run_dir = tmp_path / "run"
-    whole_save = updates.save_checkpoint
+    original_save = train_module.save_checkpoint
 
-    def interrupted(folder, step, *rest):
-        if step == 4:  # the last
+    def save_with_signal(folder, step, *arguments):
+        if step == 4:  # the last update
             signal.raise_signal(signal.SIGTERM)
-        whole_save(folder, step, *rest)
+        original_save(folder, step, *arguments)
 
-    monkeypatch.setattr(updates, "save_checkpoint", interrupted)
+    monkeypatch.setattr(train_module, "save_checkpoint", save_with_signal)
     assert train(config_file, run_dir) == 143
     message = f"interrupted: {run_dir}: stopped after update 4 of 4 and saved; run the same command again to continue"
     assert message in capsys.readouterr().err
     assert not (run_dir / "policies").exists()
+
     monkeypatch.undo()
     assert train(config_file, run_dir) == 0
     assert (run_dir / "policies").exists()
 
 
 def test_interrupts_work_in_threads_without_signal_handlers():
-    seen = []
+    pending_signals = []
 
-    def enter():
+    def enter_interrupts():
         with Interrupts() as interrupts:
-            seen.append(interrupts.pending_signal())
+            pending_signals.append(interrupts.pending_signal())
 
-    thread = threading.Thread(target=enter)
+    thread = threading.Thread(target=enter_interrupts)
     thread.start()
     thread.join()
-    assert seen == [0]
+    assert pending_signals == [0]
 
 
 @pytest.mark.parametrize(
-    ("end", "code", "message"),
+    ("interrupt", "exit_code", "message"),
     [
         (Interrupted(signal.SIGTERM, "runs/a: saved"), 143, "interrupted: runs/a: saved; run the same command again"),
         (Interrupted(signal.SIGINT, "runs/a: saved"), 130, "interrupted: runs/a: saved; run the same command again"),
         (KeyboardInterrupt(), 130, "interrupted: "),
     ],
 )
-def test_run_command_reports_an_interrupt_in_one_line(capsys, end, code, message):
+def test_run_command_reports_an_interrupt_in_one_line(capsys, interrupt, exit_code, message):
     def command(_: Console) -> None:
-        raise end
+        raise interrupt
 
-    assert run_command(command) == code
+    assert run_command(command) == exit_code
     error = capsys.readouterr().err
     assert error.startswith(message)
     assert error.count("\n") == 1

@@ -66,7 +66,7 @@ HIDDEN_CATEGORIES = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 
 
 def assert_escaped(output):
-    """Check that an output holds no hidden character but new lines, and no traceback."""
+    """Check that an output contains no hidden character except new lines, and no traceback."""
     assert output
     assert "Traceback" not in output
     characters = output.replace("\n", "")
@@ -80,10 +80,16 @@ def insert_hostile_name(words):
 # Command lines
 
 
-COMMAND_LINES = [(command, *words) for command, lines in HOSTILE_ARGUMENTS.items() for words in lines]
+def list_command_lines():
+    """All words of each command line, with a hostile name still written as `@`."""
+    command_lines = []
+    for command, argument_lists in HOSTILE_ARGUMENTS.items():
+        for arguments in argument_lists:
+            command_lines.append((command, *arguments))
+    return command_lines
 
 
-@pytest.mark.parametrize("words", COMMAND_LINES, ids=str)
+@pytest.mark.parametrize("words", list_command_lines(), ids=str)
 def test_every_command_escapes_hostile_names(words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     try:
@@ -131,25 +137,28 @@ def test_help_escapes_hostile_defaults(tmp_path, capsys):
 
 
 def read_until_closed(descriptor):
-    """Return all bytes from a pseudo terminal, whose reading fails when the process has closed its end."""
+    """Return all bytes from a pseudo terminal; reading from it fails when the process has closed its end."""
     output = b""
     with contextlib.suppress(OSError):
-        part = os.read(descriptor, 4096)
-        while part:
-            output += part
-            part = os.read(descriptor, 4096)
+        chunk = os.read(descriptor, 4096)
+        while chunk:
+            output += chunk
+            chunk = os.read(descriptor, 4096)
     return output
 
 
 @pytest.mark.skipif(not hasattr(os, "openpty"), reason="no terminals here")
 def test_parser_error_on_a_terminal_has_no_escapes():
-    """The escapes that a parser adds for a terminal are removed, and not printed as parts of a name."""
+    """The escape sequences that a parser adds for a terminal are removed, not printed as parts of a name."""
+    # A refused command, whose output goes to a pseudo terminal.
     controller, terminal = os.openpty()
     command = [sys.executable, "-m", "jaxnav", "eval", "a", "--no-such"]
     process = subprocess.Popen(command, stdout=terminal, stderr=terminal)
     os.close(terminal)
     output = read_until_closed(controller)
     assert process.wait() == 2
+
+    # The error names the option, without an escape sequence.
     assert b"--no-such" in output
     assert b"\\x1b" not in output
 
@@ -159,12 +168,12 @@ def test_parser_error_on_a_terminal_has_no_escapes():
 
 @pytest.fixture
 def scene_file(tmp_path):
-    """A scene file whose every text is hostile."""
+    """A scene file in which name, room type, world and an object's type are hostile."""
     room = draw(["....", "...."], (HOSTILE, 0.25, 0.8, 0.0, *SMALL), ("Book", 0.75, 0.8, 0.0, *SMALL))
-    scenes = [
-        dataclasses.replace(room, name=f"{HOSTILE} {split}", room_type=HOSTILE, split=split, world=HOSTILE)
-        for split in ("train", "val")
-    ]
+    room = dataclasses.replace(room, room_type=HOSTILE, world=HOSTILE)
+    scenes = []
+    for split in ("train", "val"):
+        scenes.append(dataclasses.replace(room, name=f"{HOSTILE} {split}", split=split))
     write_scenes(tmp_path / "rooms.jsonl.gz", scenes)
     return tmp_path / "rooms.jsonl.gz"
 
@@ -183,8 +192,10 @@ def scene_file(tmp_path):
 )
 def test_scenes_command_escapes_hostile_names_in_a_file(words, scene_file, monkeypatch, capsys):
     monkeypatch.chdir(scene_file.parent)
-    arguments = [str(scene_file) if word == "FILE" else word for word in words]
-    assert main(["scenes", *arguments]) in (0, 2)
+    arguments = ["scenes"]
+    for word in words:
+        arguments.append(str(scene_file) if word == "FILE" else word)
+    assert main(arguments) in (0, 2)
     assert_escaped("".join(capsys.readouterr()))
 
 
@@ -228,24 +239,28 @@ def test_to_plain_console_stays_quiet(capsys):
     assert "".join(capsys.readouterr()) == ""
 
 
+def takes_any_console(function):
+    """True if a function has an argument `console` that need not be a plain console."""
+    for argument in (*function.args.args, *function.args.kwonlyargs):
+        annotation = "" if argument.annotation is None else ast.unparse(argument.annotation)
+        if argument.arg == "console" and "PlainConsole" not in annotation:
+            return True
+    return False
+
+
 def list_console_functions():
-    """Yield module, name and source of every function that takes any console, the command line's own excepted."""
+    """Yield module, name and source of every function that takes any console, except in `jaxnav.cli`."""
     package_folder = Path(jaxnav.__file__).parent
     for module in package_folder.rglob("*.py"):
         if module.parent.name == "cli":
             continue
-        source = module.read_text()
-        for node in ast.walk(ast.parse(source)):
-            if not isinstance(node, ast.FunctionDef):
-                continue
-            for argument in (*node.args.args, *node.args.kwonlyargs):
-                annotation = "" if argument.annotation is None else ast.unparse(argument.annotation)
-                if argument.arg == "console" and "PlainConsole" not in annotation:
-                    yield module.name, node.name, ast.unparse(node)
+        for node in ast.walk(ast.parse(module.read_text())):
+            if isinstance(node, ast.FunctionDef) and takes_any_console(node):
+                yield module.name, node.name, ast.unparse(node)
 
 
 def test_every_function_prints_literally_to_the_console_of_a_caller():
-    # `show_activity` prints `Text`, which holds no markup.
+    # `show_activity` prints `Text`, which has no markup.
     functions = [function for function in list_console_functions() if function[1] != "show_activity"]
     assert len(functions) > 10
     for module, name, source in functions:

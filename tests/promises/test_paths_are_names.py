@@ -1,9 +1,9 @@
-"""A run directory may have any name: checkpoints are stored under it alone, or it is refused before anything is done.
+"""A run directory may have any name: checkpoints are stored nowhere else, or the name is refused at the start.
 
 `python -m support.path_names` in `tests` trains in every one of these directories and prints a table.
 
-Seen to fail: with the folder itself given to Orbax instead of a link, 14 of the names below cannot be read or saved; a
-`~` that is not expanded is a folder of this name.
+Seen to fail: if Orbax gets the folder itself instead of a link, 14 of the names cannot be read or saved; without
+expansion of `~`, a folder of this name is created.
 """
 
 import json
@@ -34,11 +34,13 @@ STATE = {"weights": jnp.arange(3.0)}
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES, ids=ascii)
 def test_checkpoints_are_stored_in_a_run_directory_of_any_name(name, tmp_path, monkeypatch):
-    # The working directory has the name, too.
+    # The working directory has this name, too.
     working_dir = tmp_path / name
     run_dir = Path(name)
     working_dir.mkdir()
     monkeypatch.chdir(working_dir)
+
+    # The checkpoint that is restored equals the saved one.
     checkpoint.save_checkpoint(run_dir, 1, STATE, MANIFEST)
     restored = checkpoint.restore_checkpoint(run_dir, jax.eval_shape(lambda: STATE), MANIFEST)
     assert restored is not None
@@ -53,13 +55,14 @@ def test_checkpoints_are_stored_in_a_run_directory_of_any_name(name, tmp_path, m
 
 
 @pytest.mark.slow
-def test_two_names_that_match_as_patterns_stay_apart(tmp_path):
-    for value, name in enumerate(("a*", "ab", "a[b]", "a?")):
-        checkpoint.save_checkpoint(tmp_path / name, 1 + value, STATE, MANIFEST)
-    for value, name in enumerate(("a*", "ab", "a[b]", "a?")):
+def test_names_that_match_each_other_as_patterns_keep_separate_checkpoints(tmp_path):
+    step_by_name = {"a*": 1, "ab": 2, "a[b]": 3, "a?": 4}
+    for name, step in step_by_name.items():
+        checkpoint.save_checkpoint(tmp_path / name, step, STATE, MANIFEST)
+    for name, step in step_by_name.items():
         restored = checkpoint.restore_checkpoint(tmp_path / name, jax.eval_shape(lambda: STATE), MANIFEST)
         assert restored is not None
-        assert restored.step == 1 + value
+        assert restored.step == step
 
 
 @pytest.mark.slow
@@ -73,19 +76,19 @@ def test_save_checkpoint_refuses_a_temporary_folder_with_a_hostile_name(tmp_path
 
 @pytest.mark.slow
 def test_first_checkpoint_is_read_back(tmp_path, monkeypatch):
-    digests = checkpoint.array_digests(STATE)
-    wrong_digests = digests | dict.fromkeys(digests, "0")
-    monkeypatch.setattr(checkpoint, "array_digests", lambda state: answers.pop())
+    right_digests = checkpoint.array_digests(STATE)
+    wrong_digests = right_digests | dict.fromkeys(right_digests, "0")
+    monkeypatch.setattr(checkpoint, "array_digests", lambda state: stubbed_digests.pop())
 
-    # The digests of the loaded arrays differ from those of the saved ones.
-    answers = [wrong_digests, digests]
+    # The digests of the loaded arrays, which are popped second, differ from those of the saved ones.
+    stubbed_digests = [wrong_digests, right_digests]
     with pytest.raises(InputError, match="wrong digests of \\['weights'\\]"):
         checkpoint.save_checkpoint(tmp_path / "run", 1, STATE, MANIFEST)
 
     # Later checkpoints are not read back.
-    answers = [digests]
+    stubbed_digests = [right_digests]
     checkpoint.save_checkpoint(tmp_path / "run", 2, STATE, MANIFEST)
-    assert answers == []
+    assert stubbed_digests == []
 
 
 @pytest.mark.slow
@@ -111,12 +114,12 @@ def test_home_folders_are_expanded_alike_in_every_setting(tmp_path, monkeypatch)
     assert check_config(RunConfig(run_dir="~/x", scenes="~/x")).run_dir == expected  # pyright: ignore[reportArgumentType]
     assert parse_arguments(EvalConfig, ["~/x", "--json=~/x"], "eval", "").json == expected
 
-    # YAML, and a configuration in the home folder.
+    # YAML settings, in a file in the home folder.
     (tmp_path / "a.yaml").write_text("{run_dir: ~/x, scenes: ~/x, cache: ~/x}")
     config = apply_yaml(RunConfig(), "~/a.yaml")
     assert (config.run_dir, config.scenes, config.cache) == (expected, expected, expected)
 
-    # A folder called `~` has a whole path.
+    # In an absolute path, `~` is the name of a folder.
     assert expand_home(tmp_path / "~") == tmp_path / "~"
 
 

@@ -1,7 +1,7 @@
-"""Stored data are verified when read: damage is reported, and never used.
+"""Stored data are verified when read: damage is reported, and damaged data are never used.
 
-Seen to fail, each planted alone: the digests of a checkpoint, of a record, the checksum of a shard, the SHA-256 of an
-export not compared; rows of a log not counted; shapes or values of an export not checked.
+Seen to fail with each of these checks removed: the digests of a checkpoint, the digests of a record, the checksum of a
+shard, the SHA-256 of an export, the count of a log's rows, the shapes and the values of an export.
 """
 
 import collections
@@ -20,6 +20,7 @@ from support.commands import train
 from support.corridors import compile_corridors
 from support.damage import damage
 from support.refusals import assert_message_names
+from support.tiers import params_by_tier
 from support.tiny_run import POLICY_NAMES, finished_run, tiny_config
 
 from jaxnav.errors import InputError
@@ -36,7 +37,7 @@ NUM_CHUNKS = 4
 NUM_DAMAGES = int(os.environ.get("JAXNAV_DAMAGES", "30"))
 
 
-# What is stored, how it is written, and how it is read
+# Kinds of stored data, with their writers and readers
 
 
 class StoredKind(NamedTuple):
@@ -68,13 +69,14 @@ def restore_latest(folder):
     """Return the restored checkpoint, whose state must be that of its step."""
     restored = checkpoint.restore_checkpoint(folder, jax.eval_shape(make_state, 0), MANIFEST)
     assert restored is not None
-    is_equal = jax.tree.map(lambda a, b: bool((a == b).all()), restored.state, make_state(restored.step))
+    expected_state = make_state(restored.step)
+    is_equal = jax.tree.map(lambda leaf, expected: bool((leaf == expected).all()), restored.state, expected_state)
     assert all(jax.tree.leaves(is_equal)), "a damaged state was used"
     return restored
 
 
 def restore_second(folder):
-    """Return the step of the second checkpoint, and refuse if the first had to be used."""
+    """Return the step of the second checkpoint; an error if the first one had to be used."""
     restored = restore_latest(folder)
     if restored.step < 2:
         raise InputError("the first checkpoint was used")
@@ -88,7 +90,7 @@ def run_config(run_dir):
 
 
 def write_logs(folder):
-    """Write two rows, one per arm, and one row of times for each of the chunks of two updates."""
+    """Write the logs of chunks of two updates: per chunk a row for each of two arms, and a row of times."""
     logs = RunLogs(run_config(folder))
     for step in range(2, 2 * NUM_CHUNKS + 1, 2):
         rows = [{"step": step, "arm": arm, "seed": 0, "success": step / 7} for arm in ("baseline", "layout")]
@@ -164,7 +166,8 @@ def damage_repeatedly(name, folder, num_damages, seed) -> collections.Counter[st
     """Damage one file of a copy of the stored data at a time, and count how reading it ends.
 
     Returns:
-      The number of damages that were "reported", "harmless" (the data read are equal) or "silent" (they are not).
+      The number of damages that were "reported", "harmless" (the data are read unchanged) or "silent" (changed data
+      are read without an error).
     """
     stored_kind = STORED_KINDS[name]
     rng = random.Random(f"{name} {seed}")
@@ -173,6 +176,7 @@ def damage_repeatedly(name, folder, num_damages, seed) -> collections.Counter[st
     stored_kind.write(original_dir)
     expected_data = stored_kind.read(original_dir)
 
+    # Damage a fresh copy each time.
     outcomes = collections.Counter()
     for _ in range(num_damages):
         shutil.copytree(original_dir, damaged_dir)
@@ -187,12 +191,12 @@ def damage_repeatedly(name, folder, num_damages, seed) -> collections.Counter[st
 
 
 @pytest.mark.parametrize(
-    "name", [name if name != "checkpoint" else pytest.param(name, marks=pytest.mark.slow) for name in STORED_KINDS]
+    "name", params_by_tier(STORED_KINDS, fast=STORED_KINDS.keys() - {"checkpoint"}, slow=["checkpoint"])
 )
 def test_random_damage_is_never_used_silently(name, tmp_path):
     outcomes = damage_repeatedly(name, tmp_path, 8, seed=0)
     assert outcomes["silent"] == 0
-    assert outcomes["reported"] >= 2  # harmless damage changes what is not read, such as spaces
+    assert outcomes["reported"] >= 2  # harmless damage changes parts that are not read, such as spaces
 
 
 @pytest.mark.exhaustive
@@ -216,7 +220,7 @@ def test_signed_record_with_a_changed_digit_is_refused(name, file_name, tmp_path
     record = (record_dir / file_name).read_bytes()
     digit_indices = [index for index, byte in enumerate(record) if chr(byte).isdigit()]
 
-    # Eight digits of the record, each changed alone: 0 becomes 1, ..., 9 becomes 0.
+    # Change eight digits of the record, one at a time: 0 becomes 1, ..., 9 becomes 0.
     for index in digit_indices[:: len(digit_indices) // 8]:
         next_digit = str((record[index] - ord("0") + 1) % 10).encode()
         (record_dir / file_name).write_bytes(record[:index] + next_digit + record[index + 1 :])
@@ -236,7 +240,7 @@ def test_log_with_a_changed_digit_is_refused(tmp_path):
 
 
 def flip_bit(path):
-    """Flip one bit in the middle of a file."""
+    """Flip a bit in the middle of a file."""
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
@@ -260,7 +264,7 @@ def test_restore_names_a_damaged_checkpoint_and_uses_the_one_before(tmp_path, da
     save_two_checkpoints(tmp_path)
     damage_checkpoint(tmp_path / "checkpoints/2")
 
-    # The damage is found before Orbax reads anything.
+    # The files are verified before Orbax reads them.
     restored = restore_latest(tmp_path)
     assert restored.step == 1
     (problem,) = restored.damaged
@@ -294,7 +298,7 @@ def test_log_with_a_missing_or_repeated_row_is_refused(tmp_path, row_index):
     with pytest.raises(InputError, match=f"{LOG_FILE}, line {row_index + 1}: rows are missing .*; restore"):
         RunLogs(run_config(tmp_path)).rewind(2 * NUM_CHUNKS)
 
-    # A repeated row makes the ninth of eight.
+    # The eight rows with one of them repeated have a ninth line.
     log_file.write_bytes(b"".join([*lines, lines[row_index]]))
     with pytest.raises(InputError, match=f"{LOG_FILE}, line 9: "):
         RunLogs(run_config(tmp_path)).read(LOG_FILE)
@@ -325,7 +329,7 @@ def test_train_does_not_overwrite_a_different_export(tmp_path, tmp_path_factory,
     config_file, original_dir = finished_run(tmp_path_factory)
     run_dir = shutil.copytree(original_dir, tmp_path / "run")
 
-    # Another bias, in an export with a valid digest.
+    # Replace an export by one with another bias and a valid digest.
     policy_dir = run_dir / "policies" / "layout-0"
     params, spec = load_params(policy_dir)
     params["policy"]["actor"]["bias"] = params["policy"]["actor"]["bias"] + 1

@@ -1,4 +1,4 @@
-"""Environment variables, streams and settings of other programs are inputs: they do not matter, or get one line."""
+"""Environment variables, streams and settings of other programs have no effect, or are refused in one line."""
 
 import contextlib
 import itertools
@@ -25,24 +25,24 @@ from jaxnav.viz.style import save_figure
 
 
 @contextlib.contextmanager
-def turned_on(setting):
+def enable_jax_setting(name):
     """Turn a setting of JAX on, as its environment variable does."""
-    jax.config.update(setting, True)
+    jax.config.update(name, True)
     yield
-    jax.config.update(setting, False)
+    jax.config.update(name, False)
 
 
 @pytest.fixture
-def x64():
-    with turned_on("jax_enable_x64"):
+def x64_mode():
+    with enable_jax_setting("jax_enable_x64"):
         yield
 
 
 # JAX
 
 
-@pytest.mark.usefixtures("x64")
-def test_python_refuses_the_64_bit_mode_in_one_line(tmp_path):
+@pytest.mark.usefixtures("x64_mode")
+def test_python_functions_refuse_the_64_bit_mode_in_one_line(tmp_path):
     calls = (
         require_float32,
         lambda: jaxnav.load_policy("rooms-org"),
@@ -54,43 +54,43 @@ def test_python_refuses_the_64_bit_mode_in_one_line(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.usefixtures("x64")
-def test_commands_leave_the_64_bit_mode():
+@pytest.mark.usefixtures("x64_mode")
+def test_commands_switch_the_64_bit_mode_off():
     assert run_command(lambda _: require_float32()) == 0
 
 
 @pytest.fixture
 def no_jit():
-    with turned_on("jax_disable_jit"):
+    with enable_jax_setting("jax_disable_jit"):
         yield
 
 
 @pytest.mark.usefixtures("no_jit")
-def test_commands_ignore_that_nothing_shall_be_compiled(capsys):
-    modes = []
-    assert run_command(lambda _: modes.append(jax.config.values["jax_disable_jit"])) == 0
-    assert modes == [False]
+def test_commands_warn_and_compile_although_jit_is_disabled(capsys):
+    jit_modes = []
+    assert run_command(lambda _: jit_modes.append(jax.config.values["jax_disable_jit"])) == 0
+    assert jit_modes == [False]
     assert "JAX_DISABLE_JIT is ignored" in capsys.readouterr().err
 
 
 @pytest.mark.slow
-def test_commands_compile_with_a_warning_where_jax_is_told_not_to(tmp_path):
-    # An episode takes more than a minute where nothing is compiled.
+def test_episode_command_warns_and_compiles_although_jit_is_disabled(tmp_path):
+    # Without compilation an episode takes more than a minute.
     picture = tmp_path / "episode.png"
-    returncode, output = run_jaxnav("episode", "rooms-org", "--out", picture, JAX_DISABLE_JIT="1", timeout=120)
-    assert returncode == 0, output
+    exit_code, output = run_jaxnav("episode", "rooms-org", "--out", picture, JAX_DISABLE_JIT="1", timeout=120)
+    assert exit_code == 0, output
     assert_message_names(output, "JAX_DISABLE_JIT is ignored", "from Python")
 
 
 @pytest.mark.slow
-def test_environment_is_checked_without_compilation():
+def test_check_environment_passes_without_compilation():
     env, params = jaxnav.make("rooms")
     with jax.disable_jit():
         check_environment(env, params, num_envs=1, num_steps=1)
 
 
 @pytest.mark.parametrize("error", [AssertionError(), RuntimeError("Unable to initialize backend 'x': y")])
-def test_a_missing_backend_is_one_line(error, monkeypatch, capsys):
+def test_missing_backend_is_refused_in_one_line(error, monkeypatch, capsys):
     def fail(*_):
         raise error
 
@@ -105,14 +105,14 @@ def test_a_missing_backend_is_one_line(error, monkeypatch, capsys):
     ("name", "value"),
     [("JAX_ENABLE_X64", "maybe"), ("JAX_DEFAULT_MATMUL_PRECISION", "exact"), ("JAX_NUM_CPU_DEVICES", "many")],
 )
-def test_impossible_settings_of_jax_are_one_line(name, value):
-    # JAX reads its variables when it is imported, so each needs a process of its own.
-    returncode, output = run_jaxnav("eval", "rooms-org", **{name: value})
-    assert returncode == 2
+def test_invalid_settings_of_jax_are_refused_in_one_line(name, value):
+    # JAX reads its variables when it is imported, so each setting needs a process.
+    exit_code, output = run_jaxnav("eval", "rooms-org", **{name: value})
+    assert exit_code == 2
     assert_message_names(output, f"error: {name}={value}: ", "unset it")
 
 
-def test_a_bug_is_not_taken_for_a_missing_backend():
+def test_bug_is_not_reported_as_a_missing_backend():
     def fail(_):
         raise AssertionError("a bug")
 
@@ -128,6 +128,8 @@ def test_a_bug_is_not_taken_for_a_missing_backend():
 def test_figures_do_not_depend_on_matplotlibrc(setting, tmp_path):
     rows = [{"arm": "layout", "env_steps": steps, "success": 0.5} for steps in (1, 2)]
     name, value = setting.split(": ")
+
+    # The same figure with the default settings and with the changed one.
     pictures = []
     for settings in ({}, {name: value}):
         with mpl.rc_context(settings):
@@ -140,7 +142,7 @@ def test_figures_do_not_depend_on_matplotlibrc(setting, tmp_path):
 # Forked processes
 
 
-def test_an_environment_is_refused_in_a_forked_process(monkeypatch):
+def test_forked_process_refuses_to_make_an_environment(monkeypatch):
     monkeypatch.setattr(gym.os, "getpid", lambda: -1)
     with pytest.raises(InputError, match="'async': JAX hangs in forked processes; omit the mode"):
         gymnasium.make("jaxnav.env.gym:jaxnav/rooms-v0")
@@ -150,7 +152,7 @@ def test_an_environment_is_refused_in_a_forked_process(monkeypatch):
 
 
 @pytest.mark.parametrize("columns", [1, 2, 5, 40])
-def test_help_ends_at_any_width(columns, monkeypatch, capsys):
+def test_help_is_printed_at_any_width(columns, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", str(columns))
     with pytest.raises(SystemExit):
         main(["train", "--help"])
@@ -160,49 +162,49 @@ def test_help_ends_at_any_width(columns, monkeypatch, capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize("redirection", [">&-", "2>&-", "<&-", ">&- 2>&- <&-"])
 def test_commands_run_with_closed_streams(redirection):
-    code, output = run_jaxnav("list", "worlds", redirection=redirection)
-    assert code == 0
+    exit_code, output = run_jaxnav("list", "worlds", redirection=redirection)
+    assert exit_code == 0
     assert "Traceback" not in output
 
 
 @pytest.mark.slow
 def test_play_refuses_a_closed_input():
-    code, output = run_jaxnav("play", redirection="<&-")
-    assert (code, output.count("\n")) == (2, 1)
+    exit_code, output = run_jaxnav("play", redirection="<&-")
+    assert (exit_code, output.count("\n")) == (2, 1)
     assert "play: the input is not a terminal" in output
 
 
-def test_characters_that_a_stream_lacks_are_escaped():
-    code, output = run_jaxnav("list", "küche", PYTHONIOENCODING="ascii")
-    assert code == 2
+def test_characters_outside_a_streams_encoding_are_escaped():
+    exit_code, output = run_jaxnav("list", "küche", PYTHONIOENCODING="ascii")
+    assert exit_code == 2
     assert "k\\xfcche" in output
 
 
-# The matrix: commands by environments; `python -m support.surroundings` in `tests` prints the whole
+# The matrix of commands and environments; `python -m support.surroundings` in `tests` prints all of it
 
-#: Each environment once; only commands that take a second.
-SAMPLE = list(zip(ENVIRONMENTS, itertools.cycle(["list", "list", "play"]), strict=False))
-#: A command that computes, draws and writes; all others are exhaustive.
-COMPUTING = [("no home", "show")]
+#: Each environment with one of the commands that take a second.
+SHORT_CASES = list(zip(ENVIRONMENTS, itertools.cycle(["list", "list", "play"]), strict=False))
+#: A command that computes, draws and writes; all remaining cases are exhaustive.
+SLOW_CASES = [("no home", "show")]
 
 
-def check(environment_name, command_name, folder):
-    """Check that a command in an environment ends well or with one line."""
+def assert_command_ends_well(environment_name, command_name, folder):
+    """Check that a command in an environment succeeds, or is refused in one line."""
     attempt = try_command(environment_name, command_name, folder)
     assert find_fault(environment_name, attempt, folder) is None, attempt.output
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("environment_name", "command_name"), SAMPLE)
-def test_surroundings_by_a_sample(environment_name, command_name, tmp_path):
-    check(environment_name, command_name, tmp_path)
+@pytest.mark.parametrize(("environment_name", "command_name"), SHORT_CASES)
+def test_short_command_ends_well_in_every_environment(environment_name, command_name, tmp_path):
+    assert_command_ends_well(environment_name, command_name, tmp_path)
 
 
 @pytest.mark.parametrize(
     ("environment_name", "command_name"),
-    params_by_tier(itertools.product(ENVIRONMENTS, COMMANDS), slow=COMPUTING),
+    params_by_tier(itertools.product(ENVIRONMENTS, COMMANDS), slow=SLOW_CASES),
 )
-def test_surroundings_of_every_command(environment_name, command_name, tmp_path, tmp_path_factory):
+def test_every_command_ends_well_in_every_environment(environment_name, command_name, tmp_path, tmp_path_factory):
     if command_name in ("eval", "report"):
         shutil.copytree(finished_run(tmp_path_factory)[1], tmp_path / "finished")
-    check(environment_name, command_name, tmp_path)
+    assert_command_ends_well(environment_name, command_name, tmp_path)

@@ -1,4 +1,4 @@
-"""Heat maps of the belief: those of the pictures of a search, over the squares of the home."""
+"""Tests of the heat maps of the belief: they equal those of the pictures of a search and cover the home."""
 
 from typing import Any
 
@@ -31,10 +31,11 @@ NUM_STEPS = 8
 
 @pytest.fixture(scope="module")
 def episode():
-    """A walk along the corridor in search of a chair, which is expected near the book.
+    """A walk along the corridor in search of a chair, which the belief expects near the book.
 
-    A share of this experience is removed, another one at each step.
+    The removed share of this experience differs from step to step.
     """
+    # Policies of the method `belief` with a hand-made relation between chair and book.
     spec = PolicySpec(BELIEF, len(CATEGORIES))
     params = init_params(spec, jax.random.key(0))
     params["method"]["relations"] = params["method"]["relations"].at[CHAIR, 0, BOOK].set(2.0)
@@ -47,10 +48,13 @@ def episode():
     poses = tiny.POSES_PER_CELL * np.arange(3, 3 + NUM_STEPS)
     choices = np.zeros((NUM_STEPS, MAP_SQUARES**2), np.float32)
     choices[:, 30] = 1.0
+
+    # The weight of the removal rises from step to step.
     zeros = np.zeros(NUM_STEPS, np.float32)
     removal_weight = np.linspace(0.2, 0.9, NUM_STEPS).astype(np.float32)
     layout_weights = np.ones((NUM_STEPS, len(CATEGORIES)), np.float32)
     inferred: Any = InferenceTrace._make((layout_weights, zeros, removal_weight, choices, choices, choices))
+
     places = cell_centres(CORRIDOR, standable_cells(CORRIDOR.reach))
     return PlayedEpisode(
         trace=EpisodeTrace(poses, np.full(NUM_STEPS, MOVE_AHEAD), inferred, success=False),

@@ -1,4 +1,4 @@
-"""Charts as SVG: of the page's colours and font, and of the numbers that they are given."""
+"""Tests of the charts as SVG: they use the colours and the font of the page, and draw the given numbers."""
 
 import re
 from xml.etree import ElementTree
@@ -10,7 +10,7 @@ from jaxnav.report.charts import learning_chart, make_chart, shares_chart, thres
 
 
 def report_row(variant, decoding, epsilon):
-    """A row of a report whose means are 10 + epsilon."""
+    """Row of a report whose means are 10 + epsilon."""
     row = {"variant": variant, "decoding": decoding, "epsilon": epsilon, "form": "residual"}
     for metric in ("sr", "spl", "dts"):
         row[metric] = {"mean": 10.0 + epsilon, "ci95": [5.0, 20.0], "seeds": [9.0, 11.0]}
@@ -64,7 +64,7 @@ def test_thresholds_chart_draws_the_rows_of_stde_with_argmax(monkeypatch):
 
 @pytest.fixture
 def drawn_figures(monkeypatch):
-    """The figures that charts are made of, in order."""
+    """List of the figures that charts are made of, in order."""
     figures = []
     monkeypatch.setattr("jaxnav.report.charts.to_svg", lambda figure: figures.append(figure) or "")
     return figures
@@ -86,11 +86,14 @@ def test_make_chart_lays_out_a_figure_for_the_width_of_the_page(drawn_figures):
 
 
 def test_learning_chart_has_a_band_from_the_worst_to_the_best_run(drawn_figures):
+    # Two runs, of which the second one has no success on the validation split at the second step.
     log_rows = []
     for env_steps, successes in ((1_000_000, (0.2, 0.4)), (2_000_000, (0.5, None))):
         for success in successes:
             log_rows.append({"arm": "layout", "env_steps": env_steps, "success": 0.1, "val_success": success})
     learning_chart(log_rows, None, "title")
+
+    # Corners of the band in millions of steps and percent.
     (band,) = drawn_figures[0].axes[0].collections
     corners = {tuple(corner) for corner in band.get_paths()[0].vertices.round(6)}
     assert corners == {(1.0, 20.0), (1.0, 40.0), (2.0, 50.0)}
@@ -108,6 +111,8 @@ def test_shares_chart_draws_the_parts_of_decisions_with_best_actions(drawn_figur
     ]
     report = REPORT | {"decision_shares": entries}
     shares_chart({0.0: report, 1.0: report})
+
+    # The two shares with best actions, one a line; the share with sampled actions is not drawn.
     for axes in drawn_figures[0].axes:
         points = [tuple(map(float, line.get_xydata()[0])) for line in axes.lines]
         assert points == [(5.0, 0.0), (40.0, 1.0)]

@@ -1,4 +1,4 @@
-"""The headline: its numbers are those of the report, and its verdicts those of the intervals."""
+"""Tests of the headline: its numbers are those of the report, and its verdicts follow from the intervals."""
 
 import re
 
@@ -24,7 +24,7 @@ def make_difference(epsilon, mean, bounds):
 
 
 def make_example_report(mean, change, bounds):
-    """A report with a baseline, layout weights and the change by sTDE at 0.5, next to entries of other rows."""
+    """Report with a baseline, layout weights and the change by sTDE at 0.5, next to entries of other rows."""
     rows = [
         make_row("baseline", "argmax", 11.0),
         make_row("layout", "sample", 12.0),
@@ -72,14 +72,14 @@ def test_headline_judges_a_change_by_its_interval(bounds, verdict):
     assert removal_sentence.endswith(f"{verdict}.")
 
 
-def test_key_figures_hold_the_values_at_every_shift():
+def test_key_figures_show_the_values_at_every_shift():
     values_by_title = {}
     for figure in make_headline(REPORTS, NO_ACCOUNTS, 0.5).figures:
         values_by_title[figure.title] = [value.mean for value in figure.values.values()]
     assert list(values_by_title.values()) == [[80.0, 60.0], [40.0, 30.0], [-1.0, 4.0], [3.0, 3.0]]
 
 
-def test_axis_of_a_change_holds_its_interval_around_zero():
+def test_axis_of_a_change_is_symmetric_and_contains_its_interval():
     change_figure = make_headline(REPORTS, NO_ACCOUNTS, 0.5).figures[2]
     low, high = change_figure.axis
     assert low == -high
@@ -91,6 +91,7 @@ def test_lead_over_layout_blind_agents_is_that_of_the_main_row():
     def make_lead(row_index, metric, mean):
         return ExperienceLead(row_index, "", "argmax", metric, Interval(mean, mean - 1, mean + 1), None)
 
+    # The main row, layout weights with best actions, has index 2.
     accounts = {}
     for shift in REPORTS:
         accounts[shift] = [make_lead(0, "sr", 50.0), make_lead(2, "spl", 40.0), make_lead(2, "sr", 5.0 - shift)]

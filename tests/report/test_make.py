@@ -1,4 +1,4 @@
-"""A report's numbers are those of `eval` and the accounting, and its replays those of the evaluation."""
+"""Tests of reports: their numbers equal those of `eval` and of the accounting, and their replays the evaluation."""
 
 import base64
 import dataclasses
@@ -57,7 +57,7 @@ def evaluation(run):
 
 
 def unpack_shares(packed, *shape):
-    """The numbers from 0 to 1 that were packed as bytes."""
+    """Numbers from 0 to 1 that were packed as bytes."""
     return np.frombuffer(base64.b64decode(packed), np.uint8).reshape(*shape) / 255
 
 
@@ -66,17 +66,17 @@ def decimal_numbers(text):
 
 
 def printed_numbers(table):
-    """The numbers of a terminal's table, in order."""
+    """Numbers of a table on the terminal, in order."""
     text = io.StringIO()
     Console(file=text, width=400).print(table)
     return decimal_numbers(text.getvalue())
 
 
 @pytest.mark.slow
-def test_report_tables_hold_the_numbers_of_the_evaluation(run, measurements, evaluation):
+def test_report_tables_show_the_numbers_of_the_evaluation(run, measurements, evaluation):
     results_section, experience_section, *_ = make_sections(run, {1.0: measurements}, 0.2)
 
-    # The folded table has every threshold, the open ones only that of the report.
+    # The folded table has every threshold, and the open tables have only the threshold of the report.
     (threshold_table,) = (table for table in results_section.folded if table.title.endswith("every threshold"))
     assert decimal_numbers(str(threshold_table.rows)) == printed_numbers(results_table(evaluation.report))
     row_names = []
@@ -85,7 +85,7 @@ def test_report_tables_hold_the_numbers_of_the_evaluation(run, measurements, eva
     assert "+ w + sTDE (eps=0.2)" in row_names
     assert "+ w + sTDE (eps=0)" not in row_names
 
-    # Value and cost of experience, without the other threshold.
+    # The section on experience leaves out the leads at the threshold 0.
     leads = [lead for lead in measure_leads(evaluation, evaluation) if "eps=0)" not in lead.variant]
     assert decimal_numbers(str(experience_section.tables[0].rows)) == printed_numbers(accounting_table(leads))
 
@@ -163,12 +163,12 @@ def test_replays_weigh_the_removal_by_the_gap_above_the_threshold(measurements):
             gap = unpack_shares(trace.gap, num_steps)
             weight = unpack_shares(trace.weight, num_steps)
 
-            # Only the third agent removes: ReLU(D - 0.2), of two numbers that are rounded to 1 / 255.
+            # Only the third agent removes experience, by ReLU(D - 0.2); both numbers are rounded to 1 / 255.
             expected_weight = np.maximum(gap - 0.2, 0) if agent_index == 2 else np.zeros(num_steps)
             np.testing.assert_allclose(weight, expected_weight, atol=1 / 255)
             largest_weight = max(largest_weight, weight.max())
 
-            # Only the second and the third use layout weights.
+            # Only the second and the third agent use layout weights.
             layout_weights = unpack_shares(trace.layout, -1, num_categories)
             assert len(layout_weights) == (num_steps if agent_index in (1, 2) else 0)
     assert largest_weight > 0.1
@@ -176,7 +176,7 @@ def test_replays_weigh_the_removal_by_the_gap_above_the_threshold(measurements):
 
 @pytest.mark.exhaustive
 def test_report_of_sixty_replays_is_below_eight_megabytes(run, measurements):
-    """Twenty replays take less than a third of that."""
+    """Twenty replays take less than a third of eight megabytes."""
     page_text = make_report(run, run, dataclasses.replace(OPTIONS, replays=20), QUIET)
     assert len(page_text.encode()) < 8e6 * 20 / 60
 
@@ -197,16 +197,16 @@ def test_report_of_sixty_replays_is_below_eight_megabytes(run, measurements):
     assert "<h2>Learning</h2>" not in page_text
 
 
-def test_select_episodes_puts_those_with_the_most_differing_pairs_first():
-    def agent_with(success, length):
+def test_select_episodes_puts_the_most_differing_pairs_first():
+    def make_agent(success, length):
         unused: Any = None
         return ReplayAgent("layout", "", unused, unused, unused, np.array(success, bool), np.array(length))
 
-    # Pairs that differ, by episode: none; two of three; all three; two of three, in success alone.
+    # Pairs that differ, by episode: none; two of three; all three; two of three, but only in success.
     agents = [
-        agent_with([1, 1, 1, 1], [4, 4, 4, 4]),
-        agent_with([1, 1, 1, 1], [4, 4, 5, 4]),
-        agent_with([1, 1, 1, 0], [4, 5, 6, 4]),
+        make_agent([1, 1, 1, 1], [4, 4, 4, 4]),
+        make_agent([1, 1, 1, 1], [4, 4, 5, 4]),
+        make_agent([1, 1, 1, 0], [4, 5, 6, 4]),
     ]
     assert select_episodes(agents, 3).tolist() == [2, 1, 3]
     assert select_episodes(agents, 9).tolist() == [2, 1, 3, 0]
@@ -214,7 +214,7 @@ def test_select_episodes_puts_those_with_the_most_differing_pairs_first():
 
 @pytest.fixture
 def no_measurement(monkeypatch):
-    """Fail where something is measured before the options were checked."""
+    """Fail a test that measures before it checks the options."""
     monkeypatch.setattr("jaxnav.report.make.measure_shift", lambda *_: pytest.fail("measured"))
 
 

@@ -1,4 +1,4 @@
-"""Terms: each word of the glossary opens its own definition, and nothing else changes."""
+"""Tests of the terms of the glossary: each word opens its definition, and the rest of the text stays unchanged."""
 
 import re
 
@@ -8,7 +8,7 @@ from jaxnav.report.terms import GLOSSARY, mark_terms
 
 
 def opened_terms(marked_text):
-    """Pairs of key and word of the buttons in a text."""
+    """Key and word of each button in a text."""
     return re.findall(r'popovertarget="about-(\w+)">([^<]*)</button>', marked_text)
 
 
@@ -25,7 +25,7 @@ def test_keys_and_spellings_are_unique():
     assert len(set(spellings)) == len(spellings)
 
 
-def test_a_term_is_marked_once_in_a_part_of_the_page():
+def test_a_term_is_marked_only_once_in_a_part_of_the_page():
     marked_keys = set()
     first_text = mark_terms("SR and sTDE", marked_keys)
     assert opened_terms(first_text) == [("sr", "SR"), ("stde", "sTDE")]

@@ -1,6 +1,6 @@
 """Corridors of several lengths, compiled into shards.
 
-A module of its own, because the processes that compile shards import the classes of their scenes.
+The classes are not defined in a test, because the processes that compile shards import the classes of their scenes.
 """
 
 import dataclasses
@@ -44,11 +44,11 @@ class Corridors:
 
 @dataclasses.dataclass(frozen=True)
 class GatedCorridors(Corridors):
-    """Corridors some of which wait for a file.
+    """Corridors of which some wait until a file exists.
 
     Attributes:
-      gate_path: file that opens the gate.
-      gated: indices of the corridors that wait for it.
+      gate_path: path of the file.
+      gated: indices of the corridors that wait for the file.
     """
 
     gate_path: str = "/nonexistent"
@@ -61,7 +61,7 @@ class GatedCorridors(Corridors):
 
 
 class FaultyCorridors(GatedCorridors):
-    """Corridors of which the fourth raises an error."""
+    """Corridors with an error in the fourth one."""
 
     def __getitem__(self, index: int) -> Scene:
         if index == 3:

@@ -1,4 +1,4 @@
-"""Trainings on small file systems: `python -m support.disks` in the folder `tests` prints what each of them says."""
+"""Trainings on small file systems; `python -m support.disks` in the folder `tests` prints the last line of each."""
 
 import contextlib
 import io
@@ -11,10 +11,9 @@ from support.commands import contents, train
 from support.processes import run
 from support.tiny_run import write_config
 
-#: Options of `mount`: bytes, and numbers of files, from nothing to nearly enough for the tiny run.
+#: Options of `mount` that limit bytes or files, from next to nothing to nearly enough for the tiny run.
 SIZE_LIMITS = tuple(f"size={kilobytes}k" for kilobytes in (4, 12, 24, 48, 96, 160, 240, 320, 400, 480))
 FILE_LIMITS = tuple(f"nr_inodes={count}" for count in (2, 4, 6, 8, 12, 16, 24, 32, 48, 64))
-
 
 #: First words of the lines about a training of the tiny run.
 STATUS_LINES = (
@@ -30,12 +29,12 @@ STATUS_LINES = (
 
 
 class DiskAttempt(NamedTuple):
-    """A training on a small disk, and its repetition with room.
+    """A training on a small disk, and its repetition on a larger one.
 
     Attributes:
       exit_code: exit code of the first call.
       message: last line that it printed.
-      output: everything that it printed, until its process had ended.
+      output: the whole output of its process.
       exit_code_with_room: exit code of the second call.
       files: files of the run after the second call, by relative path.
     """
@@ -48,7 +47,7 @@ class DiskAttempt(NamedTuple):
 
 
 def foreign_lines(attempt: DiskAttempt) -> list[str]:
-    """Lines that are neither about the training nor its error message."""
+    """Lines that neither describe the training nor are its error message."""
     lines = attempt.output.splitlines()[:-1]
     return [line for line in lines if not line.startswith(STATUS_LINES)]
 
@@ -63,7 +62,7 @@ def can_mount(folder: Path) -> bool:
 
 
 def train_on_small_disk(config_file: Path, disk: Path, limit: str) -> DiskAttempt:
-    """Train where there is little room, then make room and train again.
+    """Train on a small disk, then enlarge the disk and train again.
 
     Args:
       config_file: settings of the run.
@@ -77,6 +76,8 @@ def train_on_small_disk(config_file: Path, disk: Path, limit: str) -> DiskAttemp
         process = run(["-m", "jaxnav", "train", "--config", config_file, "--run-dir", disk / "run"])
         output = "".join(process.communicate())
         exit_code = process.returncode
+
+        # The second training, with enough room.
         subprocess.run(["mount", "-o", "remount,size=90m,nr_inodes=9000", disk], check=True)
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
             exit_code_with_room = train(config_file, disk / "run")

@@ -1,15 +1,17 @@
-"""Mutated files of every format through the import command.
+"""The import command on mutated files of every format.
 
 `python -m support.fuzz_importers [RUNS]` in `tests` prints the counts.
 
-A run replaces or deletes up to three values of a fixture at random places, or damages bytes of its files. Whatever
-comes of it, the command must end with code 0 and a whole scene file, or with code 2 and none.
+A run replaces or deletes up to three values of a fixture at random places, or damages bytes of its files. In every
+case the command must end with code 0 and a complete scene file, or with code 2 and no file.
 """
 
 import collections
+import contextlib
 import copy
 import gzip
 import json
+import os
 import random
 import sys
 import tempfile
@@ -49,9 +51,13 @@ _NAME_SEPARATORS = ("|", "_", "-", ".", "/", " ", "")
 
 
 class Format(NamedTuple):
-    """Describe an input: format, content, and a writer.
+    """An input of the import command.
 
-    The files of a folder are members of the content.
+    Attributes:
+      name: name of the format.
+      content: JSON value; for a folder, its files by name.
+      write: writes a content to a folder, and returns the path to import.
+      options: further options of the command.
     """
 
     name: str
@@ -60,117 +66,125 @@ class Format(NamedTuple):
     options: tuple[str, ...] = ()
 
 
-def _text(name: str) -> Callable[[Path, object], Path]:
-    def write(folder: Path, content: object) -> Path:
+def _file_writer(name: str) -> Callable[[Path, object], Path]:
+    """Return a function that writes a content as JSON to a file of this name, compressed if it ends with `.gz`."""
+
+    def write_file(folder: Path, content: object) -> Path:
         path = folder / name
         data = json.dumps(content).encode()
         path.write_bytes(gzip.compress(data) if name.endswith(".gz") else data)
         return path
 
-    return write
+    return write_file
 
 
-def _scene_folder(folder: Path, content: object) -> Path:
-    scene = folder / "Scene_Data" / "FloorPlan401"
-    scene.mkdir(parents=True)
-    for name, value in content.items() if isinstance(content, dict) else ():
-        (scene / Path(str(name)).name.encode("ascii", "ignore").decode()).write_text(json.dumps(value))
+def _write_scene_folder(folder: Path, content: object) -> Path:
+    scene_folder = folder / "Scene_Data" / "FloorPlan401"
+    scene_folder.mkdir(parents=True)
+    files = content if isinstance(content, dict) else {}
+    for name, value in files.items():
+        ascii_name = Path(str(name)).name.encode("ascii", "ignore").decode()
+        (scene_folder / ascii_name).write_text(json.dumps(value))
     return folder / "Scene_Data"
 
 
-def _mapped(folder: Path, content: object) -> Path:
+def _write_maps_and_episodes(folder: Path, content: object) -> Path:
     write_maps(folder / "maps.pbz2", content)
     return write_json(folder / "val.json.gz", {"episodes": STARTS})
 
 
 FORMATS = (
-    Format("procthor", HOUSE, _text("house.json")),
-    Format("ai2thor", METADATA, _text("room.json.gz")),
-    Format("scene-data", FILES, _scene_folder),
-    Format("habitat", EPISODES, _text("val.json.gz")),
-    Format("habitat", {"Home": {0: l_shaped_floor(), 1: bedroom()}}, _mapped, ("--maps", "maps.pbz2")),
+    Format("procthor", HOUSE, _file_writer("house.json")),
+    Format("ai2thor", METADATA, _file_writer("room.json.gz")),
+    Format("scene-data", FILES, _write_scene_folder),
+    Format("habitat", EPISODES, _file_writer("val.json.gz")),
+    Format("habitat", {"Home": {0: l_shaped_floor(), 1: bedroom()}}, _write_maps_and_episodes, ("--maps", "maps.pbz2")),
 )
 
 
-def random_name(draw: random.Random) -> str:
-    """Return an id or name: hashes, numbers and words with the separators of the formats between them."""
+def random_name(rng: random.Random) -> str:
+    """Return an id or name: hashes, numbers and words, joined by one of the separators of the formats."""
     name_parts: list[str] = []
-    for _ in range(draw.randint(1, 4)):
-        hash_text = f"{draw.getrandbits(128):032x}"[: draw.choice((4, 8, 32))]
-        name_parts.append(draw.choice((hash_text, hash_text.upper(), str(draw.randrange(-1, 999)), *_NAME_WORDS)))
-    return draw.choice(_NAME_SEPARATORS).join(name_parts)
+    for _ in range(rng.randint(1, 4)):
+        hash_text = f"{rng.getrandbits(128):032x}"[: rng.choice((4, 8, 32))]
+        name_parts.append(rng.choice((hash_text, hash_text.upper(), str(rng.randrange(-1, 999)), *_NAME_WORDS)))
+    return rng.choice(_NAME_SEPARATORS).join(name_parts)
 
 
-def mutated(content: object, draw: random.Random) -> object:
-    """Return a copy with up to three values replaced, by nasty values or random names.
+def mutated(content: object, rng: random.Random) -> object:
+    """Return a copy with up to three values deleted, or replaced by nasty values or random names."""
 
-    They may be deleted, too.
-    """
+    def draw_value() -> object:
+        return random_name(rng) if rng.random() < 0.3 else copy.deepcopy(rng.choice(NASTY))
 
-    def replacement() -> object:
-        return random_name(draw) if draw.random() < 0.3 else copy.deepcopy(draw.choice(NASTY))
-
-    for _ in range(draw.randint(1, 3)):
-        content = edited(content, draw.choice, replacement)
+    for _ in range(rng.randint(1, 3)):
+        content = edited(content, rng.choice, draw_value)
     return content
 
 
-def damaged(data: bytes, draw: random.Random) -> bytes:
-    """Return bytes without their end, or with one changed."""
-    if draw.random() < 0.5:
-        return data[: draw.randrange(len(data) + 1)]
-    index = draw.randrange(len(data))
-    return data[:index] + bytes([draw.randrange(256)]) + data[index + 1 :]
+def damaged(data: bytes, rng: random.Random) -> bytes:
+    """Return bytes without their end, or with one byte changed."""
+    if rng.random() < 0.5:
+        return data[: rng.randrange(len(data) + 1)]
+    index = rng.randrange(len(data))
+    return data[:index] + bytes([rng.randrange(256)]) + data[index + 1 :]
 
 
-def fuzz(form: Format, runs: int, seed: int = 0) -> tuple[collections.Counter, float]:
-    """Return runs by exit code, and the slowest's seconds.
+def fuzz(scene_format: Format, num_runs: int, seed: int = 0) -> tuple[collections.Counter, float]:
+    """Return the number of runs by exit code, and the seconds of the slowest run.
 
     Raises:
-      AssertionError: a run that leaves a file without success, or none with it.
+      AssertionError: a run failed and left a file, or succeeded and left none.
     """
-    draw = random.Random(seed)
-    codes = collections.Counter()
-    slowest = 0.0
-    for _ in range(runs):
+    rng = random.Random(seed)
+    exit_codes = collections.Counter()
+    slowest_s = 0.0
+    for _ in range(num_runs):
         with tempfile.TemporaryDirectory() as folder_name:
             folder = Path(folder_name)
             (folder / "in").mkdir()
 
-            # Either the bytes of a file are damaged, or values of its content.
-            damages_bytes = draw.random() < 0.3
-            content = form.content if damages_bytes else mutated(form.content, draw)
-            source = form.write(folder / "in", content)
+            # Damage the bytes of a file, or values of its content.
+            damages_bytes = rng.random() < 0.3
+            content = scene_format.content if damages_bytes else mutated(scene_format.content, rng)
+            source = scene_format.write(folder / "in", content)
             if damages_bytes:
-                file = draw.choice(sorted(path for path in folder.rglob("*") if path.is_file()))
-                file.write_bytes(damaged(file.read_bytes(), draw))
+                file = rng.choice(sorted(path for path in folder.rglob("*") if path.is_file()))
+                file.write_bytes(damaged(file.read_bytes(), rng))
 
-            # The command, timed; any exception is a crash.
-            options = [str(folder / "in" / word) if word.endswith(".pbz2") else word for word in form.options]
+            # Time the command; any exception is a crash.
             target = folder / "out" / "scenes.jsonl.gz"
-            began = time.perf_counter()
+            arguments = ["import", scene_format.name, str(source), str(target)]
+            for word in scene_format.options:
+                arguments.append(str(folder / "in" / word) if word.endswith(".pbz2") else word)
+            start_time = time.perf_counter()
             try:
-                code = main(["import", form.name, str(source), str(target), *options])
+                exit_code = main(arguments)
             except Exception:
-                code = CRASHED
-            slowest = max(slowest, time.perf_counter() - began)
-            codes[code] += 1
+                exit_code = CRASHED
+            slowest_s = max(slowest_s, time.perf_counter() - start_time)
+            exit_codes[exit_code] += 1
 
-            # A whole scene file after success, and no file otherwise.
+            # A complete scene file after success, and no file otherwise.
             file_names = [path.name for path in target.parent.iterdir()] if target.parent.exists() else []
-            assert file_names == ([target.name] if code == 0 else []), (code, file_names)
-            if code == 0:
+            assert file_names == ([target.name] if exit_code == 0 else []), (exit_code, file_names)
+            if exit_code == 0:
                 read_scenes(target)
-    return codes, slowest
+    return exit_codes, slowest_s
+
+
+def print_counts(num_runs: int) -> None:
+    """Fuzz every format, and print a table of the results."""
+    table = Table("format", "runs", "imported", "refused", "crashed", "slowest (s)")
+    # The messages of the command are not shown.
+    with open(os.devnull, "w") as no_output, contextlib.redirect_stderr(no_output):
+        for scene_format in FORMATS:
+            exit_codes, slowest_s = fuzz(scene_format, num_runs)
+            counts = (num_runs, exit_codes[0], exit_codes[2], exit_codes[CRASHED])
+            format_name = " ".join((scene_format.name, *scene_format.options))
+            table.add_row(format_name, *map(str, counts), f"{slowest_s:.2f}")
+    Console().print(table)
 
 
 if __name__ == "__main__":
-    RUNS = int(sys.argv[1]) if len(sys.argv) > 1 else 300
-    table = Table("format", "runs", "imported", "refused", "crashed", "slowest (s)")
-    silent, sys.stderr = sys.stderr, open("/dev/null", "w")  # noqa: SIM115 - what the command says of every run
-    for form in FORMATS:
-        counts, longest = fuzz(form, RUNS)
-        numbers = (RUNS, counts[0], counts[2], counts[CRASHED])
-        table.add_row(" ".join((form.name, *form.options)), *map(str, numbers), f"{longest:.2f}")
-    sys.stderr = silent
-    Console().print(table)
+    print_counts(int(sys.argv[1]) if len(sys.argv) > 1 else 300)

@@ -1,4 +1,7 @@
-"""Methods that use one part of the seam each, and some that break its contract; found as `support.methods:NAME`."""
+"""Methods of the tests, which `find_method` finds as `support.methods:NAME`.
+
+Each method uses one part of the interface of methods; the last ones break its contract.
+"""
 
 import dataclasses
 
@@ -14,7 +17,7 @@ from jaxnav.scenes.task import NUM_ACTIONS, ROTATE_RIGHT
 
 
 class Attention(Experience):
-    """Attend to the categories' rows with the memory."""
+    """Experience that attends to the rows of the categories; the query comes from the memory."""
 
     reads_memory = True
 
@@ -26,17 +29,17 @@ class Attention(Experience):
         return features.table * weights[..., None]
 
     def attend(self, encoded, memory):
-        previous = jax.nn.one_hot(memory.action, NUM_ACTIONS, dtype=jnp.float32)
-        query = self.query(jnp.concatenate([memory.hidden, previous], axis=-1))
-        score = jax.nn.softmax((encoded * query[..., None, :]).sum(axis=-1))
-        return (score[..., None] * encoded).sum(axis=-2)
+        last_action = jax.nn.one_hot(memory.action, NUM_ACTIONS, dtype=jnp.float32)
+        query = self.query(jnp.concatenate([memory.hidden, last_action], axis=-1))
+        attention_weights = jax.nn.softmax((encoded * query[..., None, :]).sum(axis=-1))
+        return (attention_weights[..., None] * encoded).sum(axis=-2)
 
 
 ATTENTIVE = Method(Attention)
 
 
 class StepwiseRelations(ObjectRelations):
-    """ORG, whose experience training computes step by step, though it does not attend."""
+    """Experience of ORG that training computes step by step, although it does not read the memory."""
 
     reads_memory = True
 
@@ -45,8 +48,8 @@ STEPWISE = Method(StepwiseRelations)
 
 
 @dataclasses.dataclass(frozen=True)
-class Counter:
-    """Numbers of views and moves, and sums of headings and actions."""
+class CountingTracker:
+    """Tracker of the numbers of views and moves, and of the sums of headings and actions."""
 
     def init(self, knowledge):
         return {"views": jnp.int32(0), "moves": jnp.int32(0), "headings": jnp.int32(0), "actions": jnp.int32(0)}
@@ -64,7 +67,7 @@ class Counter:
 
 
 class Reading(Experience):
-    """Hand the tracker's reading on."""
+    """Experience that equals the tracker's reading."""
 
     def __init__(self, spec, rngs):
         self.width = 3
@@ -73,23 +76,24 @@ class Reading(Experience):
         return reading
 
 
-COUNTING = Method(Reading, tracker=Counter())
+COUNTING = Method(Reading, tracker=CountingTracker())
 
-#: First the critic alone, then everything.
+#: Two stages of training: first only the critic learns, then all parameters do.
 STAGED = Method(ObjectRelations, stages=(Stage(0.25, lr_scale_by_path=lambda path: path[0] == "critic"), Stage(0.75)))
 
 
 def squared_values(replayed):
-    penalty = jnp.square(replayed.factual.value).mean()
-    return 3.0 * penalty, {"squared_values": penalty}
+    """Auxiliary loss of three times the mean squared value, and the metric of the mean squared value."""
+    mean_square = jnp.square(replayed.factual.value).mean()
+    return 3.0 * mean_square, {"squared_values": mean_square}
 
 
 AUXILIARY = Method(ObjectRelations, auxiliary=squared_values)
 
 
 @dataclasses.dataclass(frozen=True)
-class Habit:
-    """Make what was done likelier: fast weights are a bias per action."""
+class HabitAdaptation:
+    """Adaptation that makes past actions likelier: the fast weights are a bias per action."""
 
     rate: float = 0.5
 
@@ -97,18 +101,18 @@ class Habit:
         return jnp.zeros((*batch, NUM_ACTIONS))
 
     def decide(self, policy, pathways, memory):
-        done = jax.nn.one_hot(memory.action, NUM_ACTIONS, dtype=jnp.float32)
-        bias = memory.fast + self.rate * done
+        last_action = jax.nn.one_hot(memory.action, NUM_ACTIONS, dtype=jnp.float32)
+        bias = memory.fast + self.rate * last_action
         decision = policy.decide_with_changes(pathways, memory)
         return decision._replace(logits=decision.logits + bias, fast=bias)
 
 
-ADAPTIVE = Method(ObjectRelations, adaptation=Habit())
+ADAPTIVE = Method(ObjectRelations, adaptation=HabitAdaptation())
 
 
 @dataclasses.dataclass(frozen=True)
-class TwoChoices:
-    """Choose between the actions with even and odd numbers, by the number of views."""
+class ParityControl:
+    """Control with two choices, an even and an odd action; the number of views selects the pair."""
 
     num_choices: int = 2
     interval: int = 1
@@ -120,12 +124,12 @@ class TwoChoices:
         return 2 * (state["views"] % 3) + choice, state
 
 
-CONTROLLED = Method(Reading, tracker=Counter(), control=TwoChoices())
+CONTROLLED = Method(Reading, tracker=CountingTracker(), control=ParityControl())
 
 
 @dataclasses.dataclass(frozen=True)
-class EverySecond(TwoChoices):
-    """Choose anew after every second action; what is chosen between does not count."""
+class EverySecondControl(ParityControl):
+    """Control with a decision at every second action; the action in between is 1, and its choice is ignored."""
 
     interval: int = 2
 
@@ -136,11 +140,11 @@ class EverySecond(TwoChoices):
         return jnp.where(self.is_decision_step(state), choice, 1), state
 
 
-PATIENT = Method(Reading, tracker=Counter(), control=EverySecond())
+PATIENT = Method(Reading, tracker=CountingTracker(), control=EverySecondControl())
 
 
-class Known(Experience):
-    """Make no experience."""
+class TableRow(Experience):
+    """Experience that equals the reading of `TableTracker`."""
 
     def __init__(self, spec, rngs):
         self.width = 2
@@ -150,8 +154,8 @@ class Known(Experience):
 
 
 @dataclasses.dataclass(frozen=True)
-class Reader:
-    """Read what was learned before training."""
+class TableTracker:
+    """Tracker that reads the table that was learned before training."""
 
     def init(self, knowledge):
         return jnp.int32(0)
@@ -164,30 +168,31 @@ class Reader:
 
 
 def table_of_counts(banks, counts):
-    """Every pair's share of all counts, and the number of scenes."""
-    together = counts.sum(axis=0)
-    return {"table": together / max(together.sum(), 1.0), "scenes": {"count": sum(len(bank.names) for bank in banks)}}
+    """Learned knowledge: the share of every pair of categories in all counts, and the number of scenes."""
+    pair_counts = counts.sum(axis=0)
+    num_scenes = sum(len(bank.names) for bank in banks)
+    return {"table": pair_counts / max(pair_counts.sum(), 1.0), "scenes": {"count": num_scenes}}
 
 
-LEARNED = Method(Known, tracker=Reader(), learn=table_of_counts)
+LEARNED = Method(TableRow, tracker=TableTracker(), learn=table_of_counts)
 
 
 # Methods that break the contract
 
 
 class BatchMean(Experience):
-    """Depend on the other members of a batch."""
+    """Experience that depends on all members of a batch."""
 
     def __init__(self, spec, rngs):
         self.width = 1
 
     def encode(self, features, appearance, weights, reading):
-        seen = features.visible.sum(axis=-1, keepdims=True)
-        return jnp.full_like(seen, seen.mean())
+        num_visible = features.visible.sum(axis=-1, keepdims=True)
+        return jnp.full_like(num_visible, num_visible.mean())
 
 
 class WrongWidth(Reading):
-    """Announce another width than that of the experience."""
+    """Experience whose `width` is wrong: 5 instead of 4."""
 
     def __init__(self, spec, rngs):
         self.width = 5
@@ -197,34 +202,31 @@ class WrongWidth(Reading):
 
 
 class NotFinite(BatchMean):
-    """Make experience that is no number."""
+    """Experience that is NaN."""
 
     def encode(self, features, appearance, weights, reading):
         return jnp.log(-1.0 - features.visible[..., :1])
 
 
 @dataclasses.dataclass(frozen=True)
-class Growing(Counter):
-    """Return a state of another type than the first."""
+class DtypeChangingTracker(CountingTracker):
+    """Tracker whose update changes a count from an integer to a float."""
 
     def update(self, state, knowledge, percept):
         return {**super().update(state, knowledge, percept), "views": state["views"].astype(jnp.float32) + 1.0}
 
 
 @dataclasses.dataclass(frozen=True)
-class TooMany(TwoChoices):
-    """Turn a choice into an action that there is not."""
+class InvalidActionControl(ParityControl):
+    """Control whose actions do not exist."""
 
     def act(self, choice, state, knowledge):
         return NUM_ACTIONS + choice * ROTATE_RIGHT, state
 
 
-BROKEN = {
-    "batch": Method(BatchMean),
-    "width": Method(WrongWidth),
-    "finite": Method(NotFinite),
-    "note": Method(Reading, tracker=Growing()),
-    "action": Method(Reading, tracker=Counter(), control=TooMany()),
-}
-BATCH, WIDTH, FINITE, NOTE, ACTION = BROKEN.values()
+BATCH = Method(BatchMean)
+WIDTH = Method(WrongWidth)
+FINITE = Method(NotFinite)
+NOTE = Method(Reading, tracker=DtypeChangingTracker())
+ACTION = Method(Reading, tracker=CountingTracker(), control=InvalidActionControl())
 NO_METHOD = nnx.Module

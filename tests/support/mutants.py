@@ -1,9 +1,11 @@
-"""Mutants of the modules that hold the science: do their fast tests notice them?
+"""Mutants of the scientific modules, which the fast tests of each module have to kill.
 
-`python -m support.mutants [COUNT [SEED]]` in `tests` draws so many of all mutants, runs the tests of each one's module
-in a copy of the project, and prints the survivors and the share that was killed. It ends with code 1 below `LEAST`.
+`python -m support.mutants [COUNT [SEED]]` in `tests` draws COUNT of all mutants, runs the tests of each mutant's module
+in a copy of the project, and prints the results and the share of killed mutants. The exit code is 1 if this share is
+below `MIN_KILLED_SHARE`.
 
-A mutant has one expression changed: an operator, a comparison, a number, a truth value, a term that is left out.
+A mutant differs from the package in one expression: an operator, a comparison, a number, a truth value, or a missing
+term.
 """
 
 import ast
@@ -21,10 +23,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).parents[2]
-LEAST = 0.9
+MIN_KILLED_SHARE = 0.9
 FAST_TIER = "not slow and not exhaustive"
-SECONDS = 900  # after which a mutant counts as killed: it does not end
-#: The modules, and the files of `tests` that have to kill their mutants.
+TIMEOUT_S = 900  # a mutant whose tests take longer does not end, and counts as killed
+#: The mutated modules, and the files of `tests` that have to kill their mutants.
 TESTS = {
     "causal.py": "test_causal.py",
     "layout.py": "test_layout.py test_gaps.py test_evidence.py",
@@ -43,7 +45,7 @@ TESTS = {
         "evaluation/test_shared_design.py evaluation/test_ranks.py"
     ),
 }
-#: The functions that are changed, for modules of which only a part is science.
+#: The mutated functions of modules that are not mutated as a whole.
 FUNCTIONS = {
     "training/ppo.py": {
         "compute_advantages",
@@ -61,26 +63,34 @@ OPERATORS: dict[type, type] = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
     ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In, ast.And: ast.Or, ast.Or: ast.And,
 }  # fmt: skip
-#: Nodes that no test of behaviour is about: types, docstrings, messages.
-SKIPPED = (ast.Import, ast.ImportFrom, ast.Raise, ast.Assert, ast.JoinedStr)
+#: Nodes and fields that are not mutated, because they do not change behaviour: imports, messages, types.
+SKIPPED_NODES = (ast.Import, ast.ImportFrom, ast.Raise, ast.Assert, ast.JoinedStr)
 SKIPPED_FIELDS = {"annotation", "returns", "decorator_list"}
 
 
 class Mutant(NamedTuple):
-    """A changed expression, and the source of the whole module with it."""
+    """A module with one changed expression.
+
+    Attributes:
+      module: path in `jaxnav`.
+      line: line of the expression.
+      expression: the original expression.
+      replacement: the changed expression.
+      source: source of the whole mutated module.
+    """
 
     module: str
     line: int
-    before: str
-    after: str
+    expression: str
+    replacement: str
     source: str
 
     def __str__(self) -> str:
-        return f"{self.module}:{self.line}: {self.before}  ->  {self.after}"
+        return f"{self.module}:{self.line}: {self.expression}  ->  {self.replacement}"
 
 
 def variants(node: ast.AST) -> list[ast.expr]:
-    """Return replacements of an expression."""
+    """Return the replacements of an expression."""
     match node:
         case ast.BinOp(left, ast.Add() | ast.Sub() as operator, right):
             return [ast.BinOp(left, OPERATORS[type(operator)](), right), left, right]
@@ -88,8 +98,8 @@ def variants(node: ast.AST) -> list[ast.expr]:
             return [ast.BinOp(left, OPERATORS[type(operator)](), right)]
         case ast.BoolOp(operator, values):
             return [ast.BoolOp(OPERATORS[type(operator)](), values), *values]
-        case ast.Compare(left, [operator, *others], right) if type(operator) in OPERATORS:
-            return [ast.Compare(left, [OPERATORS[type(operator)](), *others], right)]
+        case ast.Compare(left, [operator, *later_operators], right) if type(operator) in OPERATORS:
+            return [ast.Compare(left, [OPERATORS[type(operator)](), *later_operators], right)]
         case ast.UnaryOp(_, operand):
             return [operand]
         case ast.IfExp(test, body, orelse):
@@ -101,34 +111,34 @@ def variants(node: ast.AST) -> list[ast.expr]:
     return []
 
 
-def places(node: ast.AST) -> Iterator[tuple[Callable[[ast.AST], None], ast.AST]]:
+def replaceable_nodes(node: ast.AST) -> Iterator[tuple[Callable[[ast.AST], None], ast.AST]]:
     """Yield all nodes below a node, each with a function that replaces it."""
-    for name, value in ast.iter_fields(node):
-        if name in SKIPPED_FIELDS:
+    for field_name, value in ast.iter_fields(node):
+        if field_name in SKIPPED_FIELDS:
             continue
         if isinstance(value, list):
-            children = [(functools.partial(value.__setitem__, i), child) for i, child in enumerate(value)]
+            children = [(functools.partial(value.__setitem__, index), child) for index, child in enumerate(value)]
         else:
-            children = [(functools.partial(setattr, node, name), value)]
-        for put, child in children:
-            if isinstance(child, ast.AST) and not isinstance(child, SKIPPED):
-                yield put, child
-                yield from places(child)
+            children = [(functools.partial(setattr, node, field_name), value)]
+        for replace, child in children:
+            if isinstance(child, ast.AST) and not isinstance(child, SKIPPED_NODES):
+                yield replace, child
+                yield from replaceable_nodes(child)
 
 
 def mutants_of(module: str) -> Iterator[Mutant]:
     """Yield all mutants of a module, a path in `jaxnav`."""
     tree = ast.parse((ROOT / "jaxnav" / module).read_text())
-    for put, node in list(places(_changed_part(module, tree))):
+    for replace, node in list(replaceable_nodes(_mutated_part(module, tree))):
         for variant in variants(node):
             assert isinstance(node, ast.expr)
-            put(variant)
+            replace(variant)
             yield Mutant(module, node.lineno, ast.unparse(node), ast.unparse(variant), ast.unparse(tree))
-            put(node)
+            replace(node)
 
 
-def _changed_part(module: str, tree: ast.Module) -> ast.Module:
-    """Return the functions of a module that `FUNCTIONS` names, else the whole module."""
+def _mutated_part(module: str, tree: ast.Module) -> ast.Module:
+    """Return the functions of a module that `FUNCTIONS` names; the whole module if it names none."""
     if module not in FUNCTIONS:
         return tree
 
@@ -143,20 +153,29 @@ def _changed_part(module: str, tree: ast.Module) -> ast.Module:
 
 @contextlib.contextmanager
 def project() -> Iterator[Path]:
-    """Copy what the tests need to a folder of its own."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        for part in ("jaxnav", "tests", "docs", "pyproject.toml"):
-            whole = ROOT / part
-            (shutil.copytree if whole.is_dir() else shutil.copy)(whole, folder / part)
+    """Copy the parts of the project that tests need to a temporary folder."""
+    with tempfile.TemporaryDirectory() as folder_name:
+        folder = Path(folder_name)
+        for part_name in ("jaxnav", "tests", "docs", "pyproject.toml"):
+            source = ROOT / part_name
+            if source.is_dir():
+                shutil.copytree(source, folder / part_name)
+            else:
+                shutil.copy(source, folder / part_name)
         yield folder
 
 
 def passes(folder: Path, tests: str, tier: str = FAST_TIER) -> bool:
-    """Check whether the tests of a tier in files, separated by spaces, pass in a copy of the project."""
+    """True if tests pass in a copy of the project.
+
+    Args:
+      folder: the copy.
+      tests: files in `tests`, separated by spaces.
+      tier: the tests of these files, as an expression of markers.
+    """
     environment = os.environ | {
         "PYTHONPATH": str(folder),
-        "PYTEST_XDIST_WORKER": "mutants",  # what is compiled is kept here, from one mutant to the next
+        "PYTEST_XDIST_WORKER": "mutants",  # compiled programs are kept from one mutant to the next
         "JAX_COMPILATION_CACHE_DIR": str(folder / "compiled"),
         "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
     }
@@ -164,14 +183,14 @@ def passes(folder: Path, tests: str, tier: str = FAST_TIER) -> bool:
     test_files = [str(folder / "tests" / name) for name in tests.split()]
     command = [sys.executable, "-m", "pytest", *options, *test_files]
     try:
-        process = subprocess.run(command, cwd=folder, env=environment, capture_output=True, timeout=SECONDS)
+        process = subprocess.run(command, cwd=folder, env=environment, capture_output=True, timeout=TIMEOUT_S)
     except subprocess.TimeoutExpired:
         return False
     return process.returncode == 0
 
 
 def survives(folder: Path, module: str, source: str, tests: str, tier: str = FAST_TIER) -> bool:
-    """Check whether the tests of a tier overlook another source of a module."""
+    """True if the tests of a tier pass with a changed source of a module."""
     path = folder / "jaxnav" / module
     original = path.read_text()
     path.write_text(source)
@@ -182,23 +201,28 @@ def survives(folder: Path, module: str, source: str, tests: str, tier: str = FAS
 
 
 def main(count: int, seed: int) -> bool:
-    """Draw mutants, print what becomes of them, and return whether enough were killed."""
-    everything = [mutant for module in TESTS for mutant in mutants_of(module)]
-    drawn = random.Random(seed).sample(everything, min(count, len(everything)))
-    num_drawn = collections.Counter(mutant.module for mutant in drawn)
-    killed = collections.Counter()
+    """Draw mutants, print the result of each, and return whether enough were killed."""
+    # Draw from the mutants of all modules.
+    all_mutants: list[Mutant] = []
+    for module in TESTS:
+        all_mutants.extend(mutants_of(module))
+    mutants = random.Random(seed).sample(all_mutants, min(count, len(all_mutants)))
+    num_mutants = collections.Counter(mutant.module for mutant in mutants)
+
+    num_killed = collections.Counter()
     with project() as folder:
-        for module in num_drawn:
+        for module in num_mutants:
             if not passes(folder, TESTS[module]):
                 raise SystemExit(f"the tests of {module} fail without a mutant; fix them first")
-        for mutant in drawn:
-            alive = survives(folder, mutant.module, mutant.source, TESTS[mutant.module])
-            killed[mutant.module] += not alive
-            print("SURVIVED" if alive else "killed  ", mutant, flush=True)
-    for module, number in sorted(num_drawn.items()):
-        print(f"{module}: {killed[module]} of {number} killed")
-    print(f"{killed.total()} of {len(drawn)} killed; there are {len(everything)} mutants in all")
-    return killed.total() >= LEAST * len(drawn)
+        for mutant in mutants:
+            has_survived = survives(folder, mutant.module, mutant.source, TESTS[mutant.module])
+            num_killed[mutant.module] += not has_survived
+            print("SURVIVED" if has_survived else "killed  ", mutant, flush=True)
+
+    for module, number in sorted(num_mutants.items()):
+        print(f"{module}: {num_killed[module]} of {number} killed")
+    print(f"{num_killed.total()} of {len(mutants)} killed; there are {len(all_mutants)} mutants in all")
+    return num_killed.total() >= MIN_KILLED_SHARE * len(mutants)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,7 @@
-"""Changed copies of JSON values, texts and bytes, and changed records in signed files."""
+"""Changed copies of JSON values, texts and bytes, and changed records in files with a digest."""
 
 import contextlib
 import copy
-import functools
 import json
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -19,29 +18,38 @@ JSON_VALUES = st.recursive(
     | st.floats()
     | st.text(max_size=4)
     | st.sampled_from([float("nan"), 1e308, 10**400, -1.0, "Floor", "\ud800"]),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=2), inner, max_size=2),
+    lambda children: st.lists(children, max_size=4) | st.dictionaries(st.text(max_size=2), children, max_size=2),
     max_leaves=6,
 )
 
 
 def changed(document: Any, *keys_and_value: Any) -> Any:
-    """Return a copy with the value at some keys replaced."""
-    copied = copy.deepcopy(document)
-    *keys, last, value = keys_and_value
-    functools.reduce(lambda node, key: node[key], keys, copied)[last] = value
-    return copied
+    """Return a copy with one value replaced; the arguments are the path of keys to it, and the new value."""
+    *keys, last_key, value = keys_and_value
+    changed_copy = copy.deepcopy(document)
+    _follow_keys(changed_copy, keys)[last_key] = value
+    return changed_copy
 
 
 def without(document: Any, *keys: Any) -> Any:
-    """Return a copy with the value at some keys deleted."""
-    copied = copy.deepcopy(document)
-    del functools.reduce(lambda node, key: node[key], keys[:-1], copied)[keys[-1]]
-    return copied
+    """Return a copy without one value; the arguments are the path of keys to it."""
+    *parent_keys, last_key = keys
+    changed_copy = copy.deepcopy(document)
+    del _follow_keys(changed_copy, parent_keys)[last_key]
+    return changed_copy
+
+
+def _follow_keys(document: Any, keys: Sequence[Any]) -> Any:
+    """Return the value at a path of keys."""
+    node = document
+    for key in keys:
+        node = node[key]
+    return node
 
 
 @contextlib.contextmanager
 def resigned(path: Path) -> Iterator[dict[str, Any]]:
-    """Yield the record in a signed file to be changed, and sign it again, as another version of the code would."""
+    """Yield the record of a file to be changed, and write it with a new digest, as another version of jaxnav would."""
     record = json.loads(path.read_text())
     del record[DIGEST_KEY]
     yield record
@@ -52,22 +60,27 @@ def edited(document: Any, choose: Callable[[Sequence[Any]], Any], draw_value: Ca
     """Return a copy with one value deleted or replaced.
 
     Args:
-      document: JSON value; an empty one is returned as it is.
-      choose: draws one of several.
-      draw_value: draws what takes the place of a value.
+      document: JSON value; an empty one is returned unchanged.
+      choose: draws one of several options.
+      draw_value: draws a replacement.
     """
-    node = copied = copy.deepcopy(document)
+    edited_copy = copy.deepcopy(document)
+    node = edited_copy
     while node:
         key = choose(sorted(node, key=str) if isinstance(node, dict) else range(len(node)))
+
+        # Four times in five, go on inside a value that has parts.
         if isinstance(node[key], dict | list) and node[key] and choose(range(5)):
             node = node[key]
             continue
+
+        # Delete the value, or replace it.
         if choose([False, True]):
             del node[key]
         else:
             node[key] = draw_value()
         break
-    return copied
+    return edited_copy
 
 
 @st.composite
@@ -78,10 +91,7 @@ def mutated(draw: st.DrawFn, document: Any) -> Any:
 
 @st.composite
 def mutated_text(draw: st.DrawFn, text: str) -> str:
-    """Draw copies of a text with one edit.
-
-    Up to 20 characters are replaced by up to 6.
-    """
+    """Draw copies of a text with one edit: up to 20 characters are replaced by up to 6."""
     start = draw(st.integers(0, len(text)))
     end = min(start + draw(st.integers(0, 20)), len(text))
     return text[:start] + draw(st.text('[]{}",.:-#0123456789eNn\\u\n ', max_size=6)) + text[end:]
@@ -89,7 +99,7 @@ def mutated_text(draw: st.DrawFn, text: str) -> str:
 
 @st.composite
 def mutated_bytes(draw: st.DrawFn, content: bytes) -> bytes:
-    """Draw copies of bytes of which one is replaced, the end is cut off, and up to 4 are added."""
+    """Draw copies of bytes with one byte replaced, the end cut off, and up to 4 bytes added."""
     index = draw(st.integers(0, len(content) - 1))
     end = draw(st.integers(0, len(content)))
     new_byte = bytes([draw(st.integers(0, 255))])

@@ -1,4 +1,4 @@
-"""Python processes of this repository's code."""
+"""Python processes that run the code of this repository."""
 
 import os
 import socket
@@ -10,12 +10,12 @@ REPOSITORY = Path(__file__).parents[2]
 
 
 def run(command, **environment):
-    """Start Python, its messages piped."""
-    environment = os.environ | {name: str(value) for name, value in environment.items()}
+    """Start Python with the words of a command and additional environment variables; its output is piped."""
+    variables = {name: str(value) for name, value in environment.items()}
     return subprocess.Popen(
         [sys.executable, *map(str, command)],
         cwd=REPOSITORY,
-        env=environment,
+        env=os.environ | variables,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -23,23 +23,34 @@ def run(command, **environment):
 
 
 def free_address():
-    """A port of this machine that nothing listens at."""
+    """Address of this machine with a port that no process listens on."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"127.0.0.1:{probe.getsockname()[1]}"
 
 
 def start(address, index, config_file, run_dir, *options, **environment):
-    """One of two processes on this machine that train one run."""
+    """Start one of two processes on this machine that train one run.
+
+    Args:
+      address: address at which the processes meet.
+      index: 0 or 1, the number of the process.
+      config_file: settings of the run.
+      run_dir: directory of the run.
+      *options: further options of the command.
+      **environment: further environment variables.
+    """
     command = ["train.py", "--config", config_file, "--run-dir", run_dir, "--seeds", 1]
     devices = f"--devices={address},{index},2"
-    flags = [flag for flag in os.environ.get("XLA_FLAGS", "").split() if "device_count" not in flag]
-    environment |= {"JAX_COORDINATOR_BIND_ADDRESS": address, "XLA_FLAGS": " ".join(flags)}
+
+    # The processes have one device each, whatever number of devices the tests have.
+    xla_flags = [flag for flag in os.environ.get("XLA_FLAGS", "").split() if "device_count" not in flag]
+    environment |= {"JAX_COORDINATOR_BIND_ADDRESS": address, "XLA_FLAGS": " ".join(xla_flags)}
     return run([*command, devices, *options], **environment)
 
 
 def ends(*processes, timeout=600):
-    """Exit codes and messages of processes."""
+    """Wait for processes, and return their exit codes and what they wrote to stderr."""
     try:
         messages = [process.communicate(timeout=timeout)[1] for process in processes]
     finally:

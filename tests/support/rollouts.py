@@ -1,4 +1,4 @@
-"""Rollouts in the small world, and a plain loop that repeats them decision by decision."""
+"""Rollouts in the world of `support.tiny_world`, and a plain loop that repeats them decision by decision."""
 
 import functools
 from typing import Any, NamedTuple
@@ -13,8 +13,9 @@ from jaxnav.training.config import PPOConfig
 from jaxnav.training.ppo import Learner, collect_rollout, replay_rollout
 from support import tiny_world as tiny
 
-ENVS, LENGTH = 64, tiny.STEP_LIMITS[0]
-SLOTS = 20  # of the plain loop
+ENVS = 64
+LENGTH = tiny.STEP_LIMITS[0]
+SLOTS = 20  # environments that the plain loop repeats
 ENV, PARAMS = tiny.world()
 KNOWLEDGE = tiny.knowledge()
 PRIORS = KNOWLEDGE.layout
@@ -34,25 +35,29 @@ CONFIG = PPOConfig(
     distil=0.02,
 )
 LEARNER = Learner(agent_loop=ACTING, config=CONFIG, counterfactual="distil")
-ROWS, SUCCESSOR = tiny.BANK.rows, tiny.BANK.successor
-SCENE = np.repeat([0, 1], tiny.BANK.num_cells * tiny.POSES_PER_CELL)  # of each pose
+ROWS = tiny.BANK.rows
+SUCCESSOR = tiny.BANK.successor
+#: Scene of each pose.
+SCENE = np.repeat([0, 1], tiny.BANK.num_cells * tiny.POSES_PER_CELL)
 
 
 @functools.partial(jax.jit, static_argnums=(3, 4))
-def act(weights, agent, key, coin, acting=ACTING):
+def act(weights, agent, key, use_coin, agent_loop=ACTING):
     """The agent after a rollout, and the rollout."""
-    return collect_rollout(acting, acting.bind(weights), agent, key, PARAMS, KNOWLEDGE, num_steps=LENGTH, use_coin=coin)
+    policy = agent_loop.bind(weights)
+    return collect_rollout(agent_loop, policy, agent, key, PARAMS, KNOWLEDGE, num_steps=LENGTH, use_coin=use_coin)
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def begin(key, acting=ACTING):
-    memory = acting.bind(tiny.random_params(0)).initial_memory((ENVS,))
-    return acting.start(key, ENVS, memory, KNOWLEDGE, PARAMS)
+def begin(key, agent_loop=ACTING):
+    """The agent at the start of an episode in every environment."""
+    memory = agent_loop.bind(tiny.random_params(0)).initial_memory((ENVS,))
+    return agent_loop.start(key, ENVS, memory, KNOWLEDGE, PARAMS)
 
 
 @jax.jit
 def decide_again(weights, transitions, memory):
-    """The factual and the counterfactual decisions."""
+    """The factual and the counterfactual decisions of recorded transitions."""
     replayed = replay_rollout(ACTING.bind(weights), transitions, memory, PARAMS)
     return replayed.factual, replayed.counterfactual
 
@@ -72,14 +77,15 @@ def changed_parts(params_before, params_after):
     return names
 
 
-class Rolled(NamedTuple):
-    """A rollout that continues another one, so that its episodes begin at all times.
+class RecordedRollout(NamedTuple):
+    """A rollout that continues an earlier one, so that its episodes begin at all times.
 
-    All leaves are NumPy arrays, which the types of the package do not name.
+    All leaves are NumPy arrays; the types of the package have JAX arrays.
 
     Attributes:
       weights: parameters of the policy.
-      before, after: the `Agent` before and after the rollout.
+      before: `Agent` before the rollout.
+      after: `Agent` after the rollout.
       transitions: `Transition`, leaves [T, B].
       memory: `PolicyState` before the first step.
       next_value: float32 [T, B].
@@ -94,16 +100,26 @@ class Rolled(NamedTuple):
 
 
 @functools.cache
-def rolled(coin: bool) -> Rolled:
+def rolled(use_coin: bool) -> RecordedRollout:
+    """The second of two rollouts; with coins, each step has no direct pathways with probability 1/2."""
     weights = tiny.random_params(5)
     key = jax.random.key(1)
-    before, _ = act(weights, begin(jax.random.key(0)), jax.random.fold_in(key, 0), coin)
-    after, rollout = act(weights, before, jax.random.fold_in(key, 1), coin)
-    return jax.tree.map(np.asarray, Rolled(weights, before, after, *rollout))
+    agent, _ = act(weights, begin(jax.random.key(0)), jax.random.fold_in(key, 0), use_coin)
+    last_agent, rollout = act(weights, agent, jax.random.fold_in(key, 1), use_coin)
+    return jax.tree.map(np.asarray, RecordedRollout(weights, agent, last_agent, *rollout))
 
 
-class Retraced(NamedTuple):
-    """Results of the plain loop: leaves [T, SLOTS], and parts of the last agents as lists [SLOTS]."""
+class PlainLoopResults(NamedTuple):
+    """Results of the plain loop.
+
+    Attributes:
+      layout_weights: float32 [T, SLOTS, K], the layout's weights for the goal.
+      value: float32 [T, SLOTS].
+      log_prob: float32 [T, SLOTS].
+      next_value: float32 [T, SLOTS].
+      layout: the belief after the last step, of each slot.
+      memory: the memory after the last step, of each slot.
+    """
 
     layout_weights: np.ndarray
     value: np.ndarray
@@ -114,59 +130,67 @@ class Retraced(NamedTuple):
 
 
 @functools.cache
-def retrace(coin: bool) -> Retraced:
-    """Walk along the recorded actions, one episode slot after the other."""
-    run = rolled(coin)
-    shape = (LENGTH, SLOTS)
-    value, log_prob, next_value = np.zeros((3, *shape), np.float32)
-    retraced = Retraced(np.zeros((*shape, 3), np.float32), value, log_prob, next_value, [], [])
+def retrace(use_coin: bool) -> PlainLoopResults:
+    """Walk along the recorded actions, one slot (environment) after the other."""
+    recording = rolled(use_coin)
+    results = PlainLoopResults(
+        layout_weights=np.zeros((LENGTH, SLOTS, len(tiny.CATEGORIES)), np.float32),
+        value=np.zeros((LENGTH, SLOTS), np.float32),
+        log_prob=np.zeros((LENGTH, SLOTS), np.float32),
+        next_value=np.zeros((LENGTH, SLOTS), np.float32),
+        layout=[],
+        memory=[],
+    )
     for slot in range(SLOTS):
-        _retrace_slot(run, retraced, slot)
+        _retrace_slot(recording, results, slot)
 
     # Within an episode the next value is that of the next step, or that of the agent after the rollout.
-    after = run.after
+    last_state = recording.after.state
     for slot in range(SLOTS):
-        row = ROWS[after.state.pose[slot]]
-        goal = after.state.goal[slot]
-        weights = tiny.goal_weights(retraced.layout[slot], goal)
-        last_decision, _ = tiny.decide(run.weights, row, goal, weights, retraced.memory[slot])
-        values = np.append(retraced.value[1:, slot], last_decision.value)
-        goes_on = ~(run.transitions.terminated | run.transitions.truncated)[:, slot]
-        retraced.next_value[goes_on, slot] = values[goes_on]
-    return retraced
+        row = ROWS[last_state.pose[slot]]
+        goal = last_state.goal[slot]
+        layout_weights = tiny.goal_weights(results.layout[slot], goal)
+        last_decision, _ = tiny.decide(recording.weights, row, goal, layout_weights, results.memory[slot])
+        next_values = np.append(results.value[1:, slot], last_decision.value)
+        is_inside_episode = ~(recording.transitions.terminated | recording.transitions.truncated)[:, slot]
+        results.next_value[is_inside_episode, slot] = next_values[is_inside_episode]
+    return results
 
 
-def _retrace_slot(run: Rolled, retraced: Retraced, slot: int) -> None:
+def _retrace_slot(recording: RecordedRollout, results: PlainLoopResults, slot: int) -> None:
     """Fill a column of the results, and append the last belief and memory."""
-    layout = tiny.leaves_at(run.before.perception.layout, slot)
-    memory = tiny.leaves_at(run.before.memory, slot)
+    layout = tiny.leaves_at(recording.before.perception.layout, slot)
+    memory = tiny.leaves_at(recording.before.memory, slot)
     for time in range(LENGTH):
         # The decision.
-        now = tiny.leaves_at(run.transitions, time, slot)
-        weights = tiny.goal_weights(layout, now.goal)
-        factual, counterfactual = tiny.decide(run.weights, ROWS[now.pose], now.goal, weights, memory)
-        decision = factual if now.use_direct is None or now.use_direct else counterfactual
-        retraced.layout_weights[time, slot] = weights
-        retraced.value[time, slot] = decision.value
-        retraced.log_prob[time, slot] = jax.nn.log_softmax(decision.logits)[now.action]
+        transition = tiny.leaves_at(recording.transitions, time, slot)
+        row = ROWS[transition.pose]
+        layout_weights = tiny.goal_weights(layout, transition.goal)
+        factual, counterfactual = tiny.decide(recording.weights, row, transition.goal, layout_weights, memory)
+        decision = factual if transition.use_direct is None or transition.use_direct else counterfactual
+        results.layout_weights[time, slot] = layout_weights
+        results.value[time, slot] = decision.value
+        results.log_prob[time, slot] = jax.nn.log_softmax(decision.logits)[transition.action]
 
-        # The recorded action.
-        memory = decision.next_state(jnp.int32(now.action))
-        pose = SUCCESSOR[now.pose, now.action]
-        ended = now.terminated | now.truncated
-        if now.truncated:  # the value of the cut state, with its own belief and memory
+        # The recorded action. The value after a truncation is that of the last state, with its belief and memory.
+        memory = decision.next_state(jnp.int32(transition.action))
+        pose = SUCCESSOR[transition.pose, transition.action]
+        if transition.truncated:
             last_layout = tiny.believe(PRIORS[PARAMS.room[SCENE[pose]]], layout, ROWS[pose])
-            last_weights = tiny.goal_weights(last_layout, now.goal)
-            last_decision, _ = tiny.decide(run.weights, ROWS[pose], now.goal, last_weights, memory)
-            retraced.next_value[time, slot] = last_decision.value
-        if ended:
+            last_weights = tiny.goal_weights(last_layout, transition.goal)
+            last_decision, _ = tiny.decide(recording.weights, ROWS[pose], transition.goal, last_weights, memory)
+            results.next_value[time, slot] = last_decision.value
+        is_end = transition.terminated | transition.truncated
+        if is_end:
             layout = None
             memory = PolicyState(jnp.zeros(tiny.SIZES.hidden), jnp.int32(NO_ACTION))
 
-        # The next view; after an ending, that of the next episode's start.
-        next_pose = run.transitions.pose[time + 1, slot] if time + 1 < LENGTH else run.after.state.pose[slot]
-        assert ended or next_pose == pose
+        # The next view, which after an ending is the first view of the next episode.
+        next_pose = recording.after.state.pose[slot]
+        if time + 1 < LENGTH:
+            next_pose = recording.transitions.pose[time + 1, slot]
+        assert is_end or next_pose == pose
         layout = tiny.believe(PRIORS[PARAMS.room[SCENE[next_pose]]], layout, ROWS[next_pose])
 
-    retraced.layout.append(layout)
-    retraced.memory.append(memory)
+    results.layout.append(layout)
+    results.memory.append(memory)

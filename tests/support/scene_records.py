@@ -37,7 +37,7 @@ def write_records(path: Path, *records: object) -> Path:
 
 
 def as_scene(result: Scene | InputError) -> Scene:
-    """Return a result that must be a scene."""
+    """Check that a result is a scene, and return it."""
     assert isinstance(result, Scene), result
     return result
 
@@ -83,7 +83,7 @@ def assert_scenes_equal(result: Scene | InputError, expected: Scene | InputError
 def check_outcomes(
     results: Iterable[Scene | InputError | ImportNote | ImportCount], outcomes: collections.Counter[type], path: Path
 ) -> None:
-    """Check that a scene file can hold each scene and that each error names its file; count the results by type."""
+    """Check that each scene can be written and read, and that each error names its file; count results by type."""
     scene_file = path.parent / "fuzzed.jsonl.gz"
     for result in results:
         outcomes[type(result)] += 1

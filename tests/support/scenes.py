@@ -62,7 +62,7 @@ def draw(
       walls: wall cells [iz, ix].
       origin: x and z of cell [0, 0] in metres.
     """
-    standable = np.array([[mark == "." for mark in row] for row in rows])
+    standable = np.array([list(row) for row in rows]) == "."
     wall_mask = np.zeros_like(standable)
     for cell in walls:
         wall_mask[cell] = True
@@ -77,7 +77,7 @@ def corridor_scene(num_cells: int) -> Scene:
 
 
 def coarse_scene(seed: int) -> Scene:
-    """Draw cells, walls and boxes at random on coarse steps, so that lengths often lie exactly on their limits."""
+    """Draw random cells, walls and boxes on coarse steps, so that lengths are often exactly equal to limits."""
     rng = np.random.default_rng(seed)
     standable = rng.random((7, 8)) < 0.6
     walls = rng.random((7, 8)) < 0.1  # some of them under standable cells
@@ -86,7 +86,7 @@ def coarse_scene(seed: int) -> Scene:
 
 
 def maze_scene(seed: int) -> Scene:
-    """Draw nine chambers with boxes; walls are one cell wide, and most have a door."""
+    """Draw nine chambers with boxes; the walls between them are one cell wide, and most have a door."""
     rng = np.random.default_rng(seed)
     wall_lines = (3, 7)
     walls = np.zeros((11, 11), bool)

@@ -51,7 +51,7 @@ def world():
 
 
 def compiled_world(bank=BANK):
-    """The kitchen and the bedroom as commands see them; `bank` may hold other rows for the same scenes."""
+    """The kitchen and the bedroom as a compiled world; `bank` may have changed rows for these scenes."""
     env, _ = world()
     return CompiledWorld(
         scenes=FileScenes((KITCHEN, BEDROOM), "tiny"),
@@ -85,10 +85,10 @@ def first_reading(method, count):
     """The reading of a method's tracker before the first view, [count, ...]; None without a tracker."""
     if method.tracker is None:
         return None
-    learned = {}
+    statistics = {}
     if method.learn is not None:
-        learned = method.learn([BANK], np.ones((NUM_PRIORS, len(CATEGORIES), len(CATEGORIES))))
-    method_knowledge = knowledge()._replace(method=jax.tree.map(jnp.asarray, learned))
+        statistics = method.learn([BANK], np.ones((NUM_PRIORS, len(CATEGORIES), len(CATEGORIES))))
+    method_knowledge = knowledge()._replace(method=jax.tree.map(jnp.asarray, statistics))
     reading = method.tracker.read(method.tracker.init(method_knowledge), method_knowledge, jnp.int32(0))
     return jax.tree.map(lambda leaf: jnp.repeat(leaf[None], count, axis=0), reading)
 
@@ -97,7 +97,7 @@ _init_params = jax.jit(init_params, static_argnums=0)
 
 
 def random_params(seed, spec=SPEC):
-    """Random parameters that act by what they see, unlike those of a fresh policy, which are close to indifferent."""
+    """Random parameters whose actions depend on the view; those of an untrained policy are close to indifferent."""
     params = _amplify(_init_params(spec, jax.random.key(seed)), seed + 1000)
     if spec.decision == "streams":
         params["experience_stream"] = _amplify(params["experience_stream"], seed + 2000)
@@ -105,7 +105,7 @@ def random_params(seed, spec=SPEC):
 
 
 def _amplify(params, seed):
-    """Draw the kernel of the actor anew, and triple the weights before it."""
+    """Replace the kernel of the actor by a random one, and triple the weights before it."""
     kernel = jax.random.normal(jax.random.key(seed), params["actor"]["kernel"].shape)
     actor = params["actor"] | {"kernel": kernel, "bias": jnp.zeros(kernel.shape[-1])}
     larger_weights = {}

@@ -1,4 +1,4 @@
-"""A ProcTHOR house, and a builder of others."""
+"""A ProcTHOR house, and a builder of houses."""
 
 import collections
 import itertools
@@ -12,13 +12,14 @@ def point(x: float, y: float, z: float) -> dict[str, float]:
     return {"x": x, "y": y, "z": z}
 
 
-def wall(owner: object, a: Corner, b: Corner) -> dict[str, Any]:
-    """Return a wall drawn from a to b (x, z).
+def wall(owner: object, start: Corner, end: Corner) -> dict[str, Any]:
+    """Return a wall of a room, or of the exterior, that is drawn from `start` to `end`.
 
-    Copies for the outside list the ceiling first; ids begin with the smaller end.
+    Walls of the exterior list the ceiling first; ids begin with the smaller end.
     """
-    low, high = sorted([a, b])
-    floor, ceiling = [[point(x, y, z) for x, z in (a, b)] for y in (0, 3)]
+    low, high = sorted([start, end])
+    floor = [point(x, 0, z) for x, z in (start, end)]
+    ceiling = [point(x, 3, z) for x, z in (start, end)]
     return {
         "id": f"wall|{owner}|{low[0]:.2f}|{low[1]:.2f}|{high[0]:.2f}|{high[1]:.2f}",
         "roomId": "exterior" if owner == "exterior" else f"room|{owner}",
@@ -32,21 +33,29 @@ def build(
     objects: Sequence[dict[str, Any]] = (),
     agent: Corner = (5.0, 0.5),
 ) -> dict[str, Any]:
-    """Return a house of rooms (type, corners (x, z)).
+    """Return a house of rooms, each a type with its corners (x, z).
 
-    Rooms are numbered from 2; edges of one room alone have a copy for the outside.
+    Rooms are numbered from 2. A wall that belongs to only one room has a copy that belongs to the exterior.
     """
-    edges = [
-        (2 + i, a, b) for i, (_, corners) in enumerate(rooms) for a, b in itertools.pairwise([*corners, corners[0]])
-    ]
-    count = collections.Counter(frozenset((a, b)) for _, a, b in edges)
-    outside = [("exterior", b, a) for _, a, b in edges if count[frozenset((a, b))] == 1]
+    # The rooms, and their walls as (room, start, end).
+    room_records = []
+    inner_walls: list[tuple[int, Corner, Corner]] = []
+    for room, (room_type, corners) in enumerate(rooms, start=2):
+        polygon = [point(x, 0, z) for x, z in corners]
+        room_records.append({"id": f"room|{room}", "roomType": room_type, "floorPolygon": polygon})
+        for start, end in itertools.pairwise([*corners, corners[0]]):
+            inner_walls.append((room, start, end))
+
+    # Walls of the exterior are drawn in the opposite direction.
+    num_rooms = collections.Counter(frozenset((start, end)) for _, start, end in inner_walls)
+    outer_walls: list[tuple[str, Corner, Corner]] = []
+    for _, start, end in inner_walls:
+        if num_rooms[frozenset((start, end))] == 1:
+            outer_walls.append(("exterior", end, start))
+
     return {
-        "rooms": [
-            {"id": f"room|{2 + i}", "roomType": kind, "floorPolygon": [point(x, 0, z) for x, z in corners]}
-            for i, (kind, corners) in enumerate(rooms)
-        ],
-        "walls": [wall(*edge) for edge in [*edges, *outside]],
+        "rooms": room_records,
+        "walls": [wall(owner, start, end) for owner, start, end in (*inner_walls, *outer_walls)],
         "doors": list(doors),
         "windows": [{"id": "window|2|0", "room0": "room|2", "room1": "room|2", "wall0": "anything"}],
         "objects": list(objects),
@@ -55,20 +64,24 @@ def build(
     }
 
 
-def door(wall_name: str, low: float, high: float, rooms: tuple[int, int] = (2, 3), **others: object) -> dict[str, Any]:
-    """Return a door in the walls `wall|<room>|<wall_name>`."""
+def door(wall_name: str, low: float, high: float, rooms: tuple[int, int] = (2, 3), **fields: object) -> dict[str, Any]:
+    """Return a door from `low` to `high` along the walls `wall|<room>|<wall_name>`, with additional fields."""
+    first_room, second_room = rooms
     return {
-        "id": f"door|{rooms[0]}|{rooms[1]}",
+        "id": f"door|{first_room}|{second_room}",
         "assetId": "Doorway_4",
-        **{f"room{i}": f"room|{room}" for i, room in enumerate(rooms)},
-        **{f"wall{i}": f"wall|{room}|{wall_name}" for i, room in enumerate(rooms)},
+        "room0": f"room|{first_room}",
+        "room1": f"room|{second_room}",
+        "wall0": f"wall|{first_room}|{wall_name}",
+        "wall1": f"wall|{second_room}|{wall_name}",
         "holePolygon": [point(low, 0, 0), point(high, 2.1, 0)],
-        **others,
+        **fields,
     }
 
 
-def item(name: str, asset: str, x: float, y: float, z: float, yaw: float = 0.0, **others: object) -> dict[str, Any]:
-    return {"id": name, "assetId": asset, "position": point(x, y, z), "rotation": point(0, yaw, 0), **others}
+def item(name: str, asset: str, x: float, y: float, z: float, yaw: float = 0.0, **fields: object) -> dict[str, Any]:
+    """Return an object at a position, with additional fields such as `children`."""
+    return {"id": name, "assetId": asset, "position": point(x, y, z), "rotation": point(0, yaw, 0), **fields}
 
 
 # Room 2 spans x 0-3, room 3 x 3-6, both z 0-3. The corners run clockwise, so room 2 draws the wall x = 3 downwards.
@@ -80,7 +93,7 @@ HOUSE = build(
     doors=(door("3.00|0.00|3.00|3.00", 1.0, 2.0, openable=True, openness=1),),
     objects=(TABLE,),
 )
-# Asset id to asset, and the same as lists by type.
+# The asset database as a dict of assets by id, and as a dict of lists of assets by type.
 ASSETS = {
     "Dining_Table_27_1": {"objectType": "DiningTable", "boundingBox": point(1.0, 0.8, 0.6)},
     "Bowl_1": {"objectType": "Bowl", "boundingBox": point(0.2, 0.1, 0.2)},

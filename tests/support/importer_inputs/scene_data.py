@@ -1,42 +1,53 @@
 """An offline Scene_Data folder of a 3 x 3 room."""
 
+import itertools
 import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+#: Step (dx, dz) of a move ahead by rotation in degrees.
 HEADINGS = {0: (0, 1), 45: (1, 1), 90: (1, 0), 135: (1, -1), 180: (0, -1), 225: (-1, -1), 270: (-1, 0), 315: (-1, 1)}
 
-# x 0 to 0.5 and z -0.25 to 0.25 in steps of 0.25; the agent is at 0.9 m, so the floor is at 0.
-PLACES = [(i, j) for i in range(3) for j in (-1, 0, 1)]
-GRID = [{"x": 0.25 * i, "y": 0.9, "z": 0.25 * j} for i, j in PLACES]
+HORIZONS = (0, 30)
+
+# Cells (ix, iz): x is 0 to 0.5 and z is -0.25 to 0.25 in steps of 0.25. The agent is at 0.9 m, so the floor is at 0.
+CELLS = list(itertools.product(range(3), (-1, 0, 1)))
+GRID = [{"x": 0.25 * ix, "y": 0.9, "z": 0.25 * iz} for ix, iz in CELLS]
 
 
-def state(i: int, j: int, rotation: int, horizon: int) -> str:
+def state(ix: int, iz: int, rotation: int, horizon: int) -> str:
     """Return the key of a state.
 
     Zero is written as -0.00, as some files do.
     """
-    return f"{0.25 * i or -0.0:.2f}|{0.25 * j or -0.0:.2f}|{rotation}|{horizon}"
+    return f"{0.25 * ix or -0.0:.2f}|{0.25 * iz or -0.0:.2f}|{rotation}|{horizon}"
 
 
 def links() -> list[dict[str, str]]:
-    """Return what one action leads to, by the action rules."""
-    pairs = []
-    for i, j in PLACES:
-        for rotation, (dx, dz) in HEADINGS.items():
-            for horizon in (0, 30):
-                reached = [
-                    (i, j, (rotation + 45) % 360, horizon),
-                    (i, j, (rotation - 45) % 360, horizon),
-                    (i, j, rotation, 30 - horizon),
-                    *([(i + dx, j + dz, rotation, horizon)] if (i + dx, j + dz) in PLACES else []),
-                ]
-                pairs += [(state(i, j, rotation, horizon), state(*target)) for target in reached]
-    return [{"source": source, "target": target} for source, target in pairs]
+    """Return a link from every state to each state that one action leads to."""
+    link_records = []
+    for (ix, iz), rotation, horizon in itertools.product(CELLS, HEADINGS, HORIZONS):
+        source = state(ix, iz, rotation, horizon)
+
+        # Turns to the right and to the left, a tilt of the camera, and a move ahead.
+        targets = [
+            state(ix, iz, (rotation + 45) % 360, horizon),
+            state(ix, iz, (rotation - 45) % 360, horizon),
+            state(ix, iz, rotation, 30 - horizon),
+        ]
+        dx, dz = HEADINGS[rotation]
+        if (ix + dx, iz + dz) in CELLS:
+            targets.append(state(ix + dx, iz + dz, rotation, horizon))
+        for target in targets:
+            link_records.append({"source": source, "target": target})
+    return link_records
 
 
-NODES = [{"id": state(i, j, rotation, horizon)} for i, j in PLACES for rotation in HEADINGS for horizon in (0, 30)]
+NODES = [
+    {"id": state(ix, iz, rotation, horizon)}
+    for (ix, iz), rotation, horizon in itertools.product(CELLS, HEADINGS, HORIZONS)
+]
 GRAPH = {"directed": True, "multigraph": False, "graph": {}, "nodes": NODES, "links": links()}
 VISIBLE = {
     "Fridge|+01.00|+00.00|-00.25": [state(2, 0, 90, 0), state(2, 0, 90, 30)],
@@ -51,7 +62,7 @@ FILES: dict[str, Any] = {"grid.json": GRID, "graph.json": GRAPH, "visible_object
 def write_folder(folder: Path, files: Mapping[str, object]) -> Path:
     """Write the files of a scene.
 
-    A text is written as it is, any other value as JSON; None removes a file.
+    A string is written unchanged and any other value as JSON; None removes a file.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for name, value in files.items():
