@@ -226,4 +226,5 @@ def main(count: int, seed: int) -> bool:
 
 
 if __name__ == "__main__":
-    sys.exit(not main(*(int(argument) for argument in [*sys.argv[1:], "120", "0"][:2])))
+    count_argument, seed_argument = (*sys.argv[1:], *("120", "0")[len(sys.argv) - 1 :])
+    sys.exit(not main(int(count_argument), int(seed_argument)))
