@@ -1,4 +1,4 @@
-"""Runs trained side by side, with different settings of PPO."""
+"""Batches of runs that are trained side by side with different settings of PPO."""
 
 import dataclasses
 from typing import Any
@@ -15,14 +15,14 @@ from jaxnav.runs.batch import list_run_configs, train_batch
 from jaxnav.runs.run import REACH_FILE
 
 
-def file_times(folder):
-    """When each file below a folder was written, except for its lock."""
+def list_file_times(folder):
+    """Modification time of each file below a folder, except for its lock."""
     return {path: path.stat().st_mtime_ns for path in folder.rglob("[!.]*") if path.is_file()}
 
 
 @pytest.mark.slow
-def test_a_run_of_a_batch_is_the_run_that_train_gives(tmp_path):
-    """Bit for bit, with best policies by validation and experience dropout, whose first draw precedes training."""
+def test_run_of_a_batch_is_bit_identical_to_a_single_run(tmp_path):
+    """The runs select the best policy by validation, and draw experience dropout for the first time before training."""
     config = tiny_config(tmp_path, arms=("layout",), counterfactual="none", validations=1)
     settings: dict[str, Any] = {
         "learning_rate": [1e-2, 3e-2],
@@ -37,39 +37,41 @@ def test_a_run_of_a_batch_is_the_run_that_train_gives(tmp_path):
         *((4, seed) for seed in range(4)),
     ]
 
-    # The second run is that of `train` with its settings.
+    # The second run equals a run that `train` gives with its settings.
     second_run = batch[1]
-    ppo = dataclasses.replace(config.ppo, **{name: float(values[1]) for name, values in settings.items()})
-    alone = jaxnav.train(dataclasses.replace(config, run_dir=tmp_path / "alone", ppo=ppo))
-    assert second_run.config == dataclasses.replace(alone.config, run_dir=tmp_path / "run" / "1")
-    assert second_run.log() == alone.log()
-    assert second_run.success_by_budget() == alone.success_by_budget()
+    second_settings = {name: float(values[1]) for name, values in settings.items()}
+    ppo = dataclasses.replace(config.ppo, **second_settings)
+    single_run = jaxnav.train(dataclasses.replace(config, run_dir=tmp_path / "single", ppo=ppo))
+    assert second_run.config == dataclasses.replace(single_run.config, run_dir=tmp_path / "run" / "1")
+    assert second_run.log() == single_run.log()
+    assert second_run.success_by_budget() == single_run.success_by_budget()
     # All parameters of both seeds.
-    jax.tree.map(np.testing.assert_array_equal, second_run.policies().params, alone.policies().params)
+    jax.tree.map(np.testing.assert_array_equal, second_run.policies().params, single_run.policies().params)
 
     # The first run has other settings.
-    params = [run.policies().params for run in batch]
-    assert any(jax.tree.leaves(jax.tree.map(lambda first, second: (first != second).any(), *params)))
+    params_of_runs = [run.policies().params for run in batch]
+    is_different = jax.tree.map(lambda first_leaf, second_leaf: (first_leaf != second_leaf).any(), *params_of_runs)
+    assert any(jax.tree.leaves(is_different))
 
-    # The runs are finished, so that the same call trains and measures nothing.
+    # The runs are finished, so a repeated call trains and measures nothing.
     reach_times = [(run.config.run_dir / REACH_FILE).stat().st_mtime_ns for run in batch]
-    repeated = train_batch(config, callback=chunk_rows.append, **settings)
+    repeated_batch = train_batch(config, callback=chunk_rows.append, **settings)
     assert len(chunk_rows) == 2
-    assert [run.log() for run in repeated] == [run.log() for run in batch]
-    assert [(run.config.run_dir / REACH_FILE).stat().st_mtime_ns for run in repeated] == reach_times
+    assert [run.log() for run in repeated_batch] == [run.log() for run in batch]
+    assert [(run.config.run_dir / REACH_FILE).stat().st_mtime_ns for run in repeated_batch] == reach_times
 
-    # Other settings are another batch.
+    # Other settings make another batch, which is refused in this directory.
     settings["learning_rate"] = [1e-2, 2e-2]
     with pytest.raises(InputError) as error:
         train_batch(config, **settings)
     assert_message_names(error.value, str(tmp_path / "run"), "learning_rate: [0.01, 0.03] != [0.01, 0.02]")
 
-    # A run of the batch has no training state of its own, and is not trained over.
-    times_before = file_times(batch[0].config.run_dir)
+    # A run of the batch has no training state of its own, and `train` does not overwrite it.
+    times_before = list_file_times(batch[0].config.run_dir)
     with pytest.raises(InputError) as error:
         jaxnav.train(batch[0].config)
     assert_message_names(error.value, str(batch[0].config.run_dir), "without the state", "train_batch")
-    assert file_times(batch[0].config.run_dir) == times_before
+    assert list_file_times(batch[0].config.run_dir) == times_before
 
     # The batch itself is no run.
     with pytest.raises(InputError, match=r"of a batch, give the folder of one run, such as RUN/0"):
@@ -77,7 +79,7 @@ def test_a_run_of_a_batch_is_the_run_that_train_gives(tmp_path):
 
 
 @pytest.mark.exhaustive
-def test_a_batch_of_one_run_is_not_the_run_without_its_setting(tmp_path):
+def test_batch_of_one_run_is_not_the_run_without_its_setting(tmp_path):
     config = tiny_config(tmp_path, arms=("layout",), counterfactual="none")
     train_batch(config, learning_rate=[3e-2])
     with pytest.raises(InputError) as error:
@@ -86,7 +88,7 @@ def test_a_batch_of_one_run_is_not_the_run_without_its_setting(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("settings", "parts"),
+    ("settings", "message_parts"),
     [
         ({}, ("no settings", "learning_rate")),
         ({"num_envs": [1, 2]}, ("num_envs", "cannot differ", "learning_rate")),
@@ -103,21 +105,21 @@ def test_a_batch_of_one_run_is_not_the_run_without_its_setting(tmp_path):
         ({"experience": [0.8, 1.0]}, ("experience", "two programs", "two batches")),
     ],
 )
-def test_a_batch_refuses_impossible_settings(tmp_path, settings, parts):
+def test_batch_refuses_impossible_settings(tmp_path, settings, message_parts):
     config = tiny_config(tmp_path, arms=("layout",), counterfactual="none")
     with pytest.raises(InputError) as error:
         train_batch(config, **settings)
-    assert_message_names(str(error.value), *parts)
+    assert_message_names(str(error.value), *message_parts)
     assert not (tmp_path / "run").exists()
 
 
-def test_points_differ_in_the_settings_alone(tmp_path):
+def test_configs_of_a_batch_differ_only_in_settings_and_directory(tmp_path):
     config = tiny_config(tmp_path)
-    points = list_run_configs(config, {"gamma": [0.9, 0.99]})
-    assert [point.ppo.gamma for point in points] == [0.9, 0.99]
-    assert [point.run_dir for point in points] == [tmp_path / "run" / "0", tmp_path / "run" / "1"]
-    for point in points:
-        changed = dataclasses.replace(
-            point, run_dir=config.run_dir, ppo=dataclasses.replace(point.ppo, gamma=config.ppo.gamma)
-        )
-        assert changed == config
+    run_configs = list_run_configs(config, {"gamma": [0.9, 0.99]})
+    assert [run_config.ppo.gamma for run_config in run_configs] == [0.9, 0.99]
+    assert [run_config.run_dir for run_config in run_configs] == [tmp_path / "run" / "0", tmp_path / "run" / "1"]
+
+    # Each equals the configuration of the batch, once its setting and its directory are restored.
+    for run_config in run_configs:
+        ppo = dataclasses.replace(run_config.ppo, gamma=config.ppo.gamma)
+        assert dataclasses.replace(run_config, run_dir=config.run_dir, ppo=ppo) == config

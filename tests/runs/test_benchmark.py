@@ -1,4 +1,4 @@
-"""Frozen benchmarks: what the manifest fixes, what is refused, and scores that follow from the stored episodes."""
+"""Frozen benchmarks: checksums of homes and episodes, refusals, and scores that follow from the stored episodes."""
 
 import csv
 import gzip
@@ -28,51 +28,57 @@ MANIFEST = {
 
 
 def turn_or_stop(observations):
-    """Turn to the right; Done where the goal is detected."""
-    episodes = np.arange(len(observations["goal"]))
-    is_detected = observations["detections"][episodes, observations["goal"], 0] > 0.5
+    """Actions of an agent that turns right until the goal is detected, and then chooses Done."""
+    episode_ids = np.arange(len(observations["goal"]))
+    is_detected = observations["detections"][episode_ids, observations["goal"], 0] > 0.5
     return np.where(is_detected, jaxnav.DONE, jaxnav.ROTATE_RIGHT)
 
 
 @pytest.fixture
 def tiny_benchmark(monkeypatch, tmp_path):
-    """A benchmark `tiny`, with the checksums of its homes."""
-    path = tmp_path / "tiny.yaml"
-    path.write_text(yaml.safe_dump(MANIFEST))
-    monkeypatch.setitem(benchmarks.BENCHMARKS, "tiny", path)
+    """Manifest file of a benchmark `tiny`, with the checksums of its homes."""
+    manifest_file = tmp_path / "tiny.yaml"
+    manifest_file.write_text(yaml.safe_dump(MANIFEST))
+    monkeypatch.setitem(benchmarks.BENCHMARKS, "tiny", manifest_file)
+
+    # The checksums of the compiled homes replace the empty ones.
     benchmark = load_benchmark("tiny")
     (track,) = benchmark.tracks
     checksums = []
     for shift in benchmark.shifts:
         compiled = compile_track(benchmark, track, shift, Console(quiet=True))
         checksums.append(checksum_track(benchmark, compiled))
-    path.write_text(path.read_text().replace("checksums:\n    - ''\n    - ''", f"checksums: {checksums}"))
-    return path
+    manifest = manifest_file.read_text()
+    manifest_file.write_text(manifest.replace("checksums:\n    - ''\n    - ''", f"checksums: {checksums}"))
+    return manifest_file
 
 
 def read_scores(path):
-    """The scores, and the rows of the episodes."""
-    with gzip.open(path.with_name(path.name.replace(".json", ".episodes.csv.gz")), "rt") as file:
+    """Scores of a file, and the rows of the episodes that are stored beside it."""
+    episodes_file = path.with_name(path.name.replace(".json", ".episodes.csv.gz"))
+    with gzip.open(episodes_file, "rt") as file:
         return json.loads(path.read_text()), list(csv.DictReader(file))
 
 
 @pytest.mark.slow
 def test_scores_follow_from_the_stored_episodes(tiny_benchmark, tmp_path):
     scores = run_benchmark(turn_or_stop, "tiny")
-    path = tmp_path / "scores.json"
-    scores.write(path)
-    stored_scores, episodes = read_scores(path)
+    scores_file = tmp_path / "scores.json"
+    scores.write(scores_file)
+    stored_scores, episodes = read_scores(scores_file)
     assert stored_scores["rows"] == scores.rows
     assert {row["variant"] for row in scores.rows} == {"agent", "random", "frontier", "oracle"}
 
-    # Each of the 12 episodes of every row at both shifts; `mixed` counts the 24 of both.
     for row in scores.rows:
+        # A row counts 12 episodes at its shift; `mixed` counts the 24 episodes of both shifts.
         row_episodes = []
         for episode in episodes:
             is_shift = row["shift"] == "mixed" or float(episode["shift"]) == row["shift"]
             if episode["variant"] == row["variant"] and episode["track"] == row["track"] and is_shift:
                 row_episodes.append(episode)
         assert len(row_episodes) == (24 if row["shift"] == "mixed" else 12)
+
+        # SPL weighs each success by L* / max(L, L*), and `sr@20` counts successes of at most 20 actions.
         success = np.array([int(episode["success"]) for episode in row_episodes])
         length = np.array([int(episode["length"]) for episode in row_episodes])
         best_length = np.array([int(episode["best_length"]) for episode in row_episodes])
@@ -96,9 +102,13 @@ def test_checksum_covers_tables_and_episodes(tiny_benchmark):
     (track,) = benchmark.tracks
     compiled = compile_track(benchmark, track, 0.0, Console(quiet=True))
     assert checksum_track(benchmark, compiled) == track.checksums[0]
+
+    # The tables of the two shifts differ.
     assert len(set(track.checksums)) == 2
-    text = tiny_benchmark.read_text().replace("num_episodes: 12", "num_episodes: 13")
-    tiny_benchmark.write_text(text)
+
+    # Another number of episodes gives another checksum of unchanged tables.
+    longer_manifest = tiny_benchmark.read_text().replace("num_episodes: 12", "num_episodes: 13")
+    tiny_benchmark.write_text(longer_manifest)
     assert checksum_track(load_benchmark("tiny"), compiled) != track.checksums[0]
 
 
@@ -128,7 +138,7 @@ def test_benchmarks_are_frozen(version):
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("version", CHECKSUMS)
 @pytest.mark.parametrize("name", ["rooms", "apartments", "houses"])
-def test_homes_of_benchmarks_are_those_of_their_manifests(name, version):
+def test_homes_of_benchmarks_match_the_checksums_of_their_manifests(name, version):
     benchmark = load_benchmark(version)
     (track,) = [track for track in benchmark.tracks if track.name == name]
     for shift, checksum in zip(benchmark.shifts, track.checksums, strict=True):
@@ -136,13 +146,13 @@ def test_homes_of_benchmarks_are_those_of_their_manifests(name, version):
         assert checksum_track(benchmark, compiled) == checksum
 
 
-def test_policies_act_only_with_their_categories():
+def test_policies_are_refused_on_tracks_with_other_categories():
     with pytest.raises(jaxnav.InputError, match=r"rooms-org.*other categories.*houses"):
         run_benchmark("rooms-org", tracks=["houses"])
 
 
 @pytest.mark.parametrize(
-    ("options", "named"),
+    ("options", "message_pattern"),
     [
         (["--benchmark", "v3"], "benchmark 'v3'.*v1"),
         (["--benchmark", "v2", "--tracks", "gardens"], "track 'gardens'.*rooms, apartments, houses"),
@@ -150,10 +160,10 @@ def test_policies_act_only_with_their_categories():
         (["--tracks", "rooms"], "--tracks rooms.*--benchmark"),
     ],
 )
-def test_impossible_options_are_refused(options, named, capsys, tmp_path, monkeypatch):
+def test_impossible_options_are_refused(options, message_pattern, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["rooms-org", *options]) == 2
-    assert re.search(named, capsys.readouterr().err)
+    assert re.search(message_pattern, capsys.readouterr().err)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -1,4 +1,4 @@
-"""Stages of training and the environment steps behind a policy."""
+"""Training stages, their shares of the step budget, and the environment steps behind a policy."""
 
 import dataclasses
 import json
@@ -40,34 +40,40 @@ CONFIG = RunConfig(
         ({"ppo": PPOConfig(num_envs=64.0)}, "ppo.num_envs"),  # pyright: ignore[reportArgumentType]
     ],
 )
-def test_settings_of_another_type_are_refused_in_python_too(settings, key):
+def test_check_config_refuses_settings_of_wrong_types(settings, key):
     with pytest.raises(InputError, match=f"^config: {key} must be "):
         check_config(dataclasses.replace(CONFIG, **settings))
 
 
-def test_numbers_of_numpy_are_those_of_python():
+def test_check_config_converts_numpy_numbers_and_lists():
     config = check_config(dataclasses.replace(CONFIG, seeds=np.int64(2), arms=["layout"]))
     assert (type(config.seeds), config.seeds, config.arms) == (int, 2, ("layout",))
 
 
 def test_imitation_stage_counts_towards_the_step_budget():
-    # A fifth of ten chunks of 1,280 steps.
+    # VTNet imitates first: a fifth of ten chunks of 1,280 steps. Exploration takes 30 walks of 20 steps.
     assert CONFIG.stage_by_chunk == [0, 0, 1, 1, 1, 1, 1, 1, 1, 1]
     assert CONFIG.steps_by_purpose == {"exploration": 600, "imitation": 2 * 1280, "learning": 8 * 1280}
-    plain = dataclasses.replace(CONFIG, method="org")
-    assert plain.stage_by_chunk == 10 * [0]
-    last = dataclasses.replace(CONFIG, method="tpn")
-    assert (last.stage_by_chunk, last.steps_by_purpose) == ([0, 0, 0, 0, 0, 0, 0, 0, 1, 1], CONFIG.steps_by_purpose)
-    assert dataclasses.replace(last, imitation=0.5).stage_by_chunk == 5 * [0] + 5 * [1]
-    assert plain.steps_by_purpose == {"exploration": 600, "imitation": 0, "learning": 12800}
+
+    # ORG has a single stage.
+    org_config = dataclasses.replace(CONFIG, method="org")
+    assert org_config.stage_by_chunk == 10 * [0]
+    assert org_config.steps_by_purpose == {"exploration": 600, "imitation": 0, "learning": 12800}
+
+    # TPN imitates in its last stage, with an equal budget.
+    tpn_config = dataclasses.replace(CONFIG, method="tpn")
+    assert tpn_config.stage_by_chunk == [0, 0, 0, 0, 0, 0, 0, 0, 1, 1]
+    assert tpn_config.steps_by_purpose == CONFIG.steps_by_purpose
+    assert dataclasses.replace(tpn_config, imitation=0.5).stage_by_chunk == 5 * [0] + 5 * [1]
+
     budget = "600 of random exploration for the layout priors, 2,560 of imitation learning, 10,240 of reinforcement"
     assert budget in budget_note(CONFIG.steps_by_purpose)
 
 
-@pytest.mark.parametrize(("share", "chunks"), [(0.5, 5), (0.25, 3), (0.01, 1), (0.9, 9)])
-def test_stage_share_is_rounded_to_whole_chunks(share, chunks):
+@pytest.mark.parametrize(("share", "num_chunks"), [(0.5, 5), (0.25, 3), (0.01, 1), (0.9, 9)])
+def test_stage_share_is_rounded_to_whole_chunks(share, num_chunks):
     config = check_config(dataclasses.replace(CONFIG, imitation=share))
-    assert config.stage_by_chunk == chunks * [0] + (10 - chunks) * [1]
+    assert config.stage_by_chunk == num_chunks * [0] + (10 - num_chunks) * [1]
     assert sum(stage.share for stage in config.stages) == pytest.approx(1.0)
     assert sum(config.steps_by_purpose.values()) - 600 == CONFIG.total_steps
 
@@ -103,29 +109,45 @@ def test_stage_shares_of_a_method_add_up(shares):
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("method", ["vtnet", "tpn"])
 def test_staged_run_resumes_between_its_stages(method, config, tmp_path, monkeypatch):
-    """Two chunks, one of each stage; a run that stops after the first ends as one that does not."""
-    sizes = {"token_width": 8, "feedforward": 8, "encoder_layers": 1, "decoder_layers": 1, "query_outputs": 1}
-    sizes = sizes if method == "vtnet" else {"tentative_width": 8}
+    """With two chunks, one of each stage, a run that stops after the first chunk ends like an uninterrupted run."""
+    imitates_first = method == "vtnet"
+    if imitates_first:
+        sizes = {"token_width": 8, "feedforward": 8, "encoder_layers": 1, "decoder_layers": 1, "query_outputs": 1}
+    else:
+        sizes = {"tentative_width": 8}
     options = {"method": method, "method_sizes": sizes, "imitation": 0.5, "arms": ("baseline",), "seeds": 1}
-    config = dataclasses.replace(config, **options, validations=2, val_episodes=4, run_dir=tmp_path / "whole")
-    asked = []
+    config = dataclasses.replace(config, **options, validations=2, val_episodes=4, run_dir=tmp_path / "uninterrupted")
+
+    # Train the uninterrupted run, and record with which adaptation each validation measures.
+    adapts_online_by_validation = []
     measure = Validator.measure
+
+    def record_and_measure(validator, policies, adapts_online):
+        adapts_online_by_validation.append(adapts_online)
+        return measure(validator, policies, adapts_online)
+
     with monkeypatch.context() as patch:
-        patch.setattr(Validator, "measure", lambda *given: asked.append(given[2]) or measure(*given))
+        patch.setattr(Validator, "measure", record_and_measure)
         run = train(config)
-    assert asked == [method == "vtnet", True]  # measured as the stage acts
-    imitated = ["imitation_loss" in row for row in run.log()]
-    assert imitated == ([True, False] if method == "vtnet" else [False, True])
-    assert ["policy_loss" in row for row in run.log()] == [not is_imitation for is_imitation in imitated]
+
+    # A validation adapts where its stage does: the first stage of TPN does not.
+    assert adapts_online_by_validation == [method != "tpn", True]
+
+    # A chunk of imitation logs the imitation loss, and a chunk of reinforcement learning the policy loss.
+    has_imitation_loss = ["imitation_loss" in row for row in run.log()]
+    assert has_imitation_loss == ([True, False] if imitates_first else [False, True])
+    assert ["policy_loss" in row for row in run.log()] == [not is_imitation for is_imitation in has_imitation_loss]
+
+    # Checkpoints and the report state the budget: 64 walks of 20 steps, and two chunks of 2 x 16 x 8 steps.
+    expected_budget = {"exploration": 1280, "imitation": 256, "learning": 256}
     for checkpoint in (run.config.run_dir / "checkpoints").iterdir():
         metadata = json.loads((checkpoint / "_CHECKPOINT_METADATA").read_text())["custom_metadata"]
-        assert metadata["manifest"]["config"]["budget"] == {"exploration": 1280, "imitation": 256, "learning": 256}
+        assert metadata["manifest"]["config"]["budget"] == expected_budget
 
-    resumed = train_in_two(dataclasses.replace(config, run_dir=tmp_path / "resumed"), monkeypatch)
-    assert resumed.log() == run.log()
-    policies = [
-        jaxnav.load_policy(one_run.config.run_dir / "policies" / "baseline-0").params for one_run in (run, resumed)
-    ]
-    chex.assert_trees_all_equal(*policies)
-    budget = jaxnav.evaluate(run, episodes=8).report["run"]["budget"]
-    assert budget == {"exploration": 1280, "imitation": 256, "learning": 256}
+    # The resumed run has equal logs and parameters.
+    resumed_run = train_in_two(dataclasses.replace(config, run_dir=tmp_path / "resumed"), monkeypatch)
+    assert resumed_run.log() == run.log()
+    policy = jaxnav.load_policy(run.config.run_dir / "policies" / "baseline-0")
+    resumed_policy = jaxnav.load_policy(resumed_run.config.run_dir / "policies" / "baseline-0")
+    chex.assert_trees_all_equal(policy.params, resumed_policy.params)
+    assert jaxnav.evaluate(run, episodes=8).report["run"]["budget"] == expected_budget

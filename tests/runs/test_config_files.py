@@ -1,4 +1,4 @@
-"""YAML over config dataclasses: what is taken, what is refused and how the message helps."""
+"""YAML files applied to config dataclasses: accepted values, refused values, and the advice in messages."""
 
 import dataclasses
 from pathlib import Path
@@ -34,7 +34,9 @@ class Config:
 
 
 @pytest.fixture
-def overlay(tmp_path):
+def apply_text(tmp_path):
+    """Function that applies the text of a file to the default `Config`."""
+
     def apply(text: str | bytes) -> Config:
         path = tmp_path / "config.yaml"
         path.write_bytes(text if isinstance(text, bytes) else text.encode())
@@ -43,14 +45,14 @@ def overlay(tmp_path):
     return apply
 
 
-def test_apply_yaml_changes_only_named_values(overlay):
-    # ppo.epochs is 2 in the default instance (4 in the class): what the file leaves out stays as in the instance.
-    assert overlay("ppo:\n  learning_rate: 0.5\nname: x\n") == Config(ppo=Ppo(learning_rate=0.5, epochs=2), name="x")
+def test_apply_yaml_changes_only_named_values(apply_text):
+    # ppo.epochs is 2 in the default instance and 4 in the class: values that the file omits stay as in the instance.
+    assert apply_text("ppo:\n  learning_rate: 0.5\nname: x\n") == Config(ppo=Ppo(learning_rate=0.5, epochs=2), name="x")
 
 
 @pytest.mark.parametrize("text", ["", "# nothing\n", "---\n", "{}"])
-def test_apply_yaml_of_an_empty_file_changes_nothing(overlay, text):
-    assert overlay(text) == Config()
+def test_apply_yaml_of_an_empty_file_changes_nothing(apply_text, text):
+    assert apply_text(text) == Config()
 
 
 @pytest.mark.parametrize(
@@ -70,14 +72,14 @@ def test_apply_yaml_of_an_empty_file_changes_nothing(overlay, text):
         ("name: '3'", Config(name="3")),
     ],
 )
-def test_apply_yaml_converts_values_by_annotation(overlay, text, expected):
-    result = overlay(text)
-    assert result == expected
-    assert repr(result) == repr(expected)  # 1 == 1.0, but their texts differ
+def test_apply_yaml_converts_values_by_annotation(apply_text, text, expected):
+    config = apply_text(text)
+    assert config == expected
+    assert repr(config) == repr(expected)  # 1 == 1.0, but their texts differ
 
 
 @pytest.mark.parametrize(
-    ("text", "key", "expected", "wrong_type"),
+    ("text", "key", "expected_type", "wrong_value"),
     [
         ("ppo: {learning_rate: fast}", "ppo.learning_rate", "float", "'fast' (str)"),
         ("ppo: {learning_rate: true}", "ppo.learning_rate", "float", "True (bool)"),
@@ -99,10 +101,10 @@ def test_apply_yaml_converts_values_by_annotation(overlay, text, expected):
         ("ppo:", "ppo", "a mapping", "null"),
     ],
 )
-def test_apply_yaml_refuses_values_of_wrong_types(overlay, text, key, expected, wrong_type):
+def test_apply_yaml_refuses_values_of_wrong_types(apply_text, text, key, expected_type, wrong_value):
     with pytest.raises(InputError) as error:
-        overlay(text)
-    for part in ("config.yaml: ", f" {key} ", expected, wrong_type):
+        apply_text(text)
+    for part in ("config.yaml: ", f" {key} ", expected_type, wrong_value):
         assert part in str(error.value)
 
 
@@ -122,9 +124,9 @@ def test_apply_yaml_refuses_values_of_wrong_types(overlay, text, key, expected, 
         ("ppo: {learning_rate: 1.0e+400}", "ppo.learning_rate", "'1.0e+400', which is too large"),
     ],
 )
-def test_apply_yaml_refuses_ambiguous_and_too_large_numbers(overlay, text, key, problem):
+def test_apply_yaml_refuses_ambiguous_and_too_large_numbers(apply_text, text, key, problem):
     with pytest.raises(InputError) as error:
-        overlay(text)
+        apply_text(text)
     assert_message_names(error.value, "config.yaml: ", f"{key} must be", problem, "; change the value")
 
 
@@ -140,8 +142,8 @@ def test_apply_yaml_refuses_ambiguous_and_too_large_numbers(overlay, text, key, 
         ("ppo: {learning_rate: Infinity}", Config(ppo=Ppo(learning_rate=float("inf"), epochs=2))),
     ],
 )
-def test_apply_yaml_reads_numbers_with_one_meaning(overlay, text, expected):
-    assert overlay(text) == expected
+def test_apply_yaml_reads_numbers_with_one_meaning(apply_text, text, expected):
+    assert apply_text(text) == expected
 
 
 @pytest.mark.parametrize("seed", ["010", "1:30"])
@@ -153,7 +155,7 @@ def test_settings_of_a_run_refuse_ambiguous_seeds(tmp_path, seed):
 
 
 @pytest.mark.parametrize(
-    ("text", "parts"),
+    ("text", "message_parts"),
     [
         ("ppo: {learning_rat: 1}", ["unknown key ppo.learning_rat", "did you mean ppo.learning_rate?"]),
         ("nmae: x", ["unknown key nmae", "did you mean name?"]),
@@ -164,10 +166,10 @@ def test_settings_of_a_run_refuse_ambiguous_seeds(tmp_path, seed):
         ("just words", ["holds 'just words' (str)", "give a mapping"]),
     ],
 )
-def test_apply_yaml_refuses_unknown_keys_and_non_mappings(overlay, text, parts):
+def test_apply_yaml_refuses_unknown_keys_and_non_mappings(apply_text, text, message_parts):
     with pytest.raises(InputError) as error:
-        overlay(text)
-    for part in ["config.yaml: ", *parts]:
+        apply_text(text)
+    for part in ["config.yaml: ", *message_parts]:
         assert part in str(error.value)
 
 
@@ -181,17 +183,21 @@ def test_apply_yaml_names_the_new_name_of_a_renamed_key(tmp_path):
     path.write_text("sizes: {relation_layers: 2}")
     with pytest.raises(InputError, match=r"key sizes.relation_layers was renamed; use method_sizes.relation_layers$"):
         apply_yaml(RunConfig(), path)
+
+    # The message also names the place of a nested configuration.
     path.write_text("base: {sizes: {hidden: 8, relation_layers: 2}}")
     message = r"key base.sizes.relation_layers was renamed; use method_sizes.relation_layers$"
     with pytest.raises(InputError, match=message):
         apply_yaml(Nested(), path)
+
+    # The new name is accepted.
     path.write_text("base: {method_sizes: {relation_layers: 2}}")
     assert apply_yaml(Nested(), path).base == RunConfig(method_sizes={"relation_layers": 2})
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("text", "place"),
+    ("text", "message"),
     [
         ("name: x\nname: y\n", "line 2: not valid YAML (name is given twice)"),
         ("ppo:\n  epochs: 1\n  anneal: true\n  'epochs': 2\n", "line 4: not valid YAML (epochs is given twice)"),
@@ -204,10 +210,10 @@ def test_apply_yaml_names_the_new_name_of_a_renamed_key(tmp_path):
         ("[" * 5000, "not valid YAML ("),
     ],
 )
-def test_apply_yaml_names_the_line_of_broken_yaml(overlay, text, place):
+def test_apply_yaml_names_the_line_of_broken_yaml(apply_text, text, message):
     with pytest.raises(InputError) as error:
-        overlay(text)
-    assert place in str(error.value)
+        apply_text(text)
+    assert message in str(error.value)
 
 
 def test_apply_yaml_refuses_missing_files_and_folders(tmp_path):
@@ -221,7 +227,7 @@ def test_apply_yaml_reads_packaged_configurations_by_name():
     assert apply_yaml(RunConfig(), Path("smoke")).seeds == 1
 
 
-def test_a_file_may_extend_another(tmp_path):
+def test_configuration_extends_another_file_or_a_packaged_one(tmp_path):
     (tmp_path / "first.yaml").write_text("name: first\nppo: {learning_rate: 0.5}\nepsilons: [1, 2]\n")
     (tmp_path / "second.yaml").write_text("extends: first.yaml\nname: second\nppo: {clip: 0.1}\n")
     (tmp_path / "third.yaml").write_text("extends: packaged\nepsilons: []\n")
@@ -234,7 +240,7 @@ def test_a_file_may_extend_another(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("extends", "parts"),
+    ("extends", "message_parts"),
     [
         ("second.yaml", ("first.yaml", "extends itself", "name another configuration")),
         ("../{folder}/first.yaml", ("first.yaml", "extends itself")),
@@ -244,18 +250,18 @@ def test_a_file_may_extend_another(tmp_path):
         ("[a, b]", ("first.yaml", "extends", "['a', 'b']", "change the value")),
     ],
 )
-def test_impossible_extensions_are_refused(tmp_path, extends, parts):
+def test_impossible_extensions_are_refused(tmp_path, extends, message_parts):
     (tmp_path / "first.yaml").write_text(f"extends: {extends.format(folder=tmp_path.name)}\n")
     (tmp_path / "second.yaml").write_text("extends: first.yaml\n")
     with pytest.raises(InputError) as error:
         apply_yaml(Config(), tmp_path / "first.yaml")
-    assert_message_names(error.value, *parts)
+    assert_message_names(error.value, *message_parts)
 
 
 @pytest.mark.parametrize("text", ["false", "[]", "0", "''"])
-def test_a_file_must_hold_a_mapping(overlay, text):
+def test_apply_yaml_requires_a_mapping(apply_text, text):
     with pytest.raises(InputError, match="give a mapping of names to values"):
-        overlay(text)
+        apply_text(text)
 
 
 @given(

@@ -1,4 +1,4 @@
-"""`jaxnav.evaluate` and `jaxnav eval` for agents that are no policies of jaxnav."""
+"""`jaxnav.evaluate` and `jaxnav eval` for agents that are functions or objects of other code."""
 
 import csv
 import json
@@ -31,7 +31,7 @@ def returns_logits(observations):
 
 @pytest.fixture(scope="module")
 def scene_file(tmp_path_factory):
-    """Four rooms, one of each type."""
+    """File of four rooms, one of each type."""
     path = tmp_path_factory.mktemp("agents") / "rooms.jsonl.gz"
     scenes = make_generated_scenes("rooms", "val", 4)
     write_scenes(path, [scenes[index] for index in range(4)])
@@ -40,7 +40,7 @@ def scene_file(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def agent_module(tmp_path, monkeypatch):
-    """A working directory with a module of agents."""
+    """Working directory with a module of agents, and with a module that exits when imported."""
     monkeypatch.chdir(tmp_path)
     Path("always.py").write_text(AGENT_MODULE)
     Path("ending.py").write_text("import sys\nsys.exit(0)\n")  # a script without a main guard
@@ -48,63 +48,63 @@ def agent_module(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def results(scene_file):
+    """Results of an agent that chooses Done at every step."""
+
     def always_done(observations):
         return np.full(len(observations["goal"]), jaxnav.DONE)
 
     return jaxnav.evaluate(always_done, scenes=scene_file, episodes=NUM_EPISODES)
 
 
-def test_agents_stand_beside_the_references_on_the_same_episodes(results, scene_file):
+def test_agent_and_references_are_evaluated_on_equal_episodes(results, scene_file):
     assert [row.variant for row in results.rows] == ["agent", "random", "frontier", "oracle"]
     metrics = results.metrics()
-    always_done, random, frontier, oracle = metrics["sr"][:, 0]
+    agent_success, random_success, frontier_success, oracle_success = metrics["sr"][:, 0]
 
-    # Done at the start succeeds exactly where the shortest path is Done alone.
+    # Done at the start succeeds exactly where the shortest path has one action.
     scenes = make_generated_scenes("rooms", "val", 4)
     bank = compile_bank((scenes[index] for index in range(4)), jaxnav.Task())
     episodes = draw_episodes(bank, NUM_EPISODES)
     np.testing.assert_array_equal(results.episodes.best_length, episodes.best_length)
-    np.testing.assert_array_equal(always_done, episodes.best_length == 1)
-    np.testing.assert_array_equal(metrics["wrong_done"][0, 0], 1 - always_done)
-    assert oracle.all()
-    assert random.sum() < frontier.sum() <= oracle.sum()
+    np.testing.assert_array_equal(agent_success, episodes.best_length == 1)
+    np.testing.assert_array_equal(metrics["wrong_done"][0, 0], 1 - agent_success)
+    assert oracle_success.all()
+    assert random_success.sum() < frontier_success.sum() <= oracle_success.sum()
 
     # Rows and differences of the report; one agent is no sample of training runs, so seeds have no deviation.
     report = results.report
     assert [row["method"] for row in report["rows"]] == ["always_done"] * 4
-    assert report["rows"][0]["sr"]["mean"] == pytest.approx(100 * always_done.mean())
+    assert report["rows"][0]["sr"]["mean"] == pytest.approx(100 * agent_success.mean())
     assert report["rows"][0]["sr"]["std"] is None
-    pairs = {(difference["from"], difference["to"]) for difference in report["differences"]}
-    assert pairs == {("random", "agent"), ("frontier", "agent")}
+    compared_variants = {(difference["from"], difference["to"]) for difference in report["differences"]}
+    assert compared_variants == {("random", "agent"), ("frontier", "agent")}
 
 
-def test_a_list_of_agents_is_a_set_of_training_seeds(scene_file):
-    class Chooser:
+def test_list_of_agents_is_evaluated_as_training_seeds(scene_file):
+    class ConstantAgent:
         def __init__(self, action):
             self.action = action
 
         def predict(self, observations):
             return np.full(len(observations["goal"]), self.action)
 
-    agents = [Chooser(jaxnav.DONE), Chooser(jaxnav.ROTATE_LEFT)]
+    agents = [ConstantAgent(jaxnav.DONE), ConstantAgent(jaxnav.ROTATE_LEFT)]
     results = jaxnav.evaluate(agents, scenes=scene_file, episodes=NUM_EPISODES)
     success = results.metrics()["sr"][0]
-    assert (success.shape, success[1].sum()) == ((2, NUM_EPISODES), 0)
+    assert success.shape == (2, NUM_EPISODES)
+    assert success[1].sum() == 0
     assert results.report["rows"][0]["sr"]["seeds"] == pytest.approx(100 * success.mean(axis=1))
-    assert results.report["rows"][0]["method"] == "Chooser"
+    assert results.report["rows"][0]["method"] == "ConstantAgent"
 
 
 def test_eval_command_evaluates_an_agent_of_a_module(scene_file, capsys):
     options = ("--scenes", scene_file, "--episodes", NUM_EPISODES)
     assert evaluate("always:always_done", *options) == 0
+
+    # The table names the agent, the references and their difference.
     printed = capsys.readouterr()
-    for label in (
-        "always_done",
-        "Random",
-        "Frontier search",
-        "Shortest path (oracle)",
-        "always_done vs. Frontier search",
-    ):
+    row_labels = ("always_done", "Random", "Frontier search", "Shortest path (oracle)")
+    for label in (*row_labels, "always_done vs. Frontier search"):
         assert label in printed.out
     assert "actions in" in printed.err
 
@@ -140,29 +140,32 @@ def test_options_about_experience_are_refused_for_agents(capsys):
         jaxnav.evaluate(lambda observations: observations["goal"], inner_steps=1)
 
 
-def test_policies_are_found_by_name_path_and_object():
+def test_policy_is_found_by_name_and_as_an_object():
     """One policy is evaluated as a run of one seed in the world of its training."""
     policy = jaxnav.load_policy("rooms-org")
     layouts = []
-    for subject in map(find_subject, ("rooms-org", policy)):
+    for source in ("rooms-org", policy):
+        subject = find_subject(source)
         assert isinstance(subject, PolicySubject)
         layouts.append(subject.policies.knowledge.layout)
-        assert (subject.config.world, subject.policies.arms, subject.policies.num_seeds) == ("rooms", ("layout",), 1)
+        assert subject.config.world == "rooms"
+        assert (subject.policies.arms, subject.policies.num_seeds) == (("layout",), 1)
     assert jnp.array_equal(*layouts)
 
 
 @pytest.mark.exhaustive
-def test_a_packaged_policy_is_evaluated_with_its_removals(scene_file):
+def test_packaged_policy_is_evaluated_with_removal_of_experience(scene_file):
     results = jaxnav.evaluate("rooms-org", scenes=scene_file, episodes=NUM_EPISODES, costs="none")
     variants = [row.variant for row in results.rows]
     assert variants == [*["layout", "tde", "stde"] * 2, "random", "oracle"]
-    # Intervals are over scenes, for one policy shows no spread between trainings.
+    # Intervals are over scenes, because one policy shows no spread between trainings.
     assert results.report["rows"][0]["sr"]["ci95"] is not None
     assert results.report["run"]["subject"] == "rooms-org"
     assert not any("training seed" in note for note in results.report["notes"])
 
 
-def test_printed_results_are_the_table(results):
+def test_printed_results_show_the_table(results):
+    printed = str(results)
     for name in ("SR", "SPL", "Random", "Frontier"):
-        assert name in str(results)
-    assert max(map(len, str(results).splitlines())) < 400
+        assert name in printed
+    assert max(len(line) for line in printed.splitlines()) < 400

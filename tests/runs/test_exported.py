@@ -1,4 +1,4 @@
-"""An exported step acts as the policy, where neither jaxnav nor flax can be imported."""
+"""Exported programs act as their policies, also where neither jaxnav nor flax can be imported."""
 
 import dataclasses
 import json
@@ -28,8 +28,10 @@ from jaxnav.scenes.tables.observation_row import RowFormat
 
 NUM_EPISODES = 3
 NUM_STEPS = 4
-#: A process that knows JAX alone runs the code of the model card, then the steps of a file.
-JAX_ALONE = """
+#: Methods whose program is exported with streams in the tests; the decision of all other methods is fused.
+STREAM_METHODS = ("savn", "sp", "vtnet")
+#: Code of a process that imports JAX and none of its libraries: the code of the model card, then the steps of a file.
+JAX_ONLY_SCRIPT = """
 import sys
 
 class RefuseImports:
@@ -52,13 +54,13 @@ np.savez("results.npz", **results)
 """
 
 
-# The same steps by the policy and by its program
+# Equal steps by the policy and by its program
 
 
 def draw_steps(policy: LoadedPolicy) -> dict[str, np.ndarray]:
-    """Return random inputs [NUM_STEPS, NUM_EPISODES, ...] of a program, beside its memory.
+    """Return random inputs [NUM_STEPS, NUM_EPISODES, ...] of a program, without its memory.
 
-    They belong to no world, so no two of them are alike. The second episode begins anew at step 2.
+    The inputs belong to no world, so no two of them are alike. The second episode begins anew at step 2.
     """
     rng = np.random.default_rng(0)
     shapes = input_shapes(policy, NUM_EPISODES)
@@ -77,22 +79,26 @@ def draw_steps(policy: LoadedPolicy) -> dict[str, np.ndarray]:
 
 
 def stack_results(results: list[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """Return the results of steps as arrays with a leading axis, without those that the method does not have."""
-    return {
-        name: np.stack([result[name] for result in results]) for name, value in results[0].items() if value is not None
-    }
+    """Return the results of steps as arrays with a leading axis, without results that the method does not have."""
+    stacked_results = {}
+    for name, value in results[0].items():
+        if value is not None:
+            stacked_results[name] = np.stack([result[name] for result in results])
+    return stacked_results
 
 
 def act_by_policy(policy: LoadedPolicy, steps: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the policy's results [NUM_STEPS, NUM_EPISODES, ...], one episode after the other."""
+    """Return the policy's results [NUM_STEPS, NUM_EPISODES, ...], which it computes episode by episode."""
     decide = jax.jit(LoadedPolicy.decide)
     row_format = RowFormat(policy.spec.num_categories)
-    episodes = []
+    results_by_episode = []
     for episode in range(NUM_EPISODES):
         results = []
         memory = policy.begin(jnp.int32(0))
         for time in range(NUM_STEPS):
             inputs = {name: jnp.asarray(values[time, episode]) for name, values in steps.items()}
+
+            # A first step begins a new memory; a later one gets the action that was taken.
             if inputs["first"]:
                 memory = policy.begin(inputs["room"])
             else:
@@ -109,12 +115,17 @@ def act_by_policy(policy: LoadedPolicy, steps: dict[str, np.ndarray]) -> dict[st
             for name in ("logits", "factual", "counterfactual", "gap", "weights"):
                 result[name] = getattr(choice, name)
             results.append(result)
-        episodes.append(stack_results(results))
-    return {name: np.stack([episode[name] for episode in episodes], axis=1) for name in episodes[0]}
+        results_by_episode.append(stack_results(results))
+
+    # The episodes become the second axis.
+    stacked_results = {}
+    for name in results_by_episode[0]:
+        stacked_results[name] = np.stack([episode_results[name] for episode_results in results_by_episode], axis=1)
+    return stacked_results
 
 
 def assert_programs_agree(result, expected, rounding_step=0.0):
-    """Check two compiled programs: where logits are rounded to a grid, one may take the next step of it."""
+    """Check the results of two compiled programs, which may round logits to neighbouring steps of a grid."""
     assert result.keys() == expected.keys()
     np.testing.assert_array_equal(result["action"], expected["action"])
     # (1 + s) a - s a_bar, with s in [0, 1], moves by at most three steps.
@@ -125,7 +136,7 @@ def assert_programs_agree(result, expected, rounding_step=0.0):
 
 
 @pytest.mark.slow
-def test_model_card_program_runs_with_jax_alone(drawn_run, tmp_path):
+def test_program_of_the_model_card_needs_only_jax(drawn_run, tmp_path):
     out_dir = tmp_path / "out"
     options = ["--format", "stablehlo", "--policy", "layout-1", "--out", str(out_dir)]
     assert main(["export", str(drawn_run.config.run_dir), *options]) == 0
@@ -136,16 +147,16 @@ def test_model_card_program_runs_with_jax_alone(drawn_run, tmp_path):
     np.savez(out_dir / "steps.npz", **steps)
     card = (out_dir / "README.md").read_text()
     (code,) = re.findall(r"```python\n(.*?)```", card, re.DOTALL)
-    subprocess.run([sys.executable, "-c", JAX_ALONE.format(code=code)], cwd=out_dir, check=True, timeout=200)
+    subprocess.run([sys.executable, "-c", JAX_ONLY_SCRIPT.format(code=code)], cwd=out_dir, check=True, timeout=200)
 
-    # It acts as the policy does, and removes experience.
+    # The program acts as the policy does, and removes experience.
     results = np.load(out_dir / "results.npz")
     expected = act_by_policy(policy, steps)
     assert_programs_agree({name: results[name] for name in results.files}, expected)
     assert np.ptp(expected["gap"]) > 0.01
     assert not np.allclose(expected["logits"], expected["factual"])
 
-    # The names of actions, categories and inputs are those of the policy.
+    # Actions, categories and inputs are described as those of the policy.
     description = json.loads((out_dir / "step.json").read_text())
     assert description["actions"][0] == "MoveAhead"
     assert description["categories"] == list(drawn_run.config.task.categories)
@@ -154,18 +165,25 @@ def test_model_card_program_runs_with_jax_alone(drawn_run, tmp_path):
         assert fact in card
 
 
+def default_decision(method_name: str) -> str:
+    """Return the decision with which the program of a method is tested."""
+    return "streams" if method_name in STREAM_METHODS else "fused"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("method_name", "decision"),
     [
         ("org", "streams"),
-        *params_by_tier([(name, "streams" if name in ("savn", "sp", "vtnet") else "fused") for name in METHODS]),
+        *params_by_tier([(name, default_decision(name)) for name in METHODS]),
     ],
 )
 def test_exported_program_acts_as_its_policy(method_name, decision):
     method = METHODS[method_name]
     direct = "goal" if decision == "streams" else "all"
     spec = dataclasses.replace(tiny.SPEC, method=method, method_sizes=(), decision=decision, direct=direct)
+
+    # The policy, with random parameters and the knowledge that its method learns in the tiny world.
     knowledge = tiny.knowledge()
     if method.learn is not None:
         learned = method.learn([tiny.BANK], np.ones((NUM_PRIORS, spec.num_categories, spec.num_categories)))
@@ -173,7 +191,7 @@ def test_exported_program_acts_as_its_policy(method_name, decision):
     estimator = tiny.ESTIMATOR if method.hosts_layout else None
     policy = LoadedPolicy(tiny.random_params(2, spec), knowledge, spec, estimator, tiny.BANK.task)
 
-    # The program, read back from its bytes, step by step.
+    # Read the program back from its bytes, and run it step by step.
     exported = jax.export.deserialize(bytearray(export_program(policy)))
     steps = draw_steps(policy)
     memory_shapes = input_shapes(policy, NUM_EPISODES)["memory"]
@@ -185,6 +203,7 @@ def test_exported_program_acts_as_its_policy(method_name, decision):
         memory = outputs.pop("memory")
         results.append(outputs)
 
+    # Streams round their logits to a grid.
     rounding_step = 2.0**-10 if decision == "streams" else 0.0
     assert_programs_agree(stack_results(results), act_by_policy(policy, steps), rounding_step)
 
@@ -200,21 +219,21 @@ def test_export_command_copies_policies_and_replaces_earlier_exports(drawn_run, 
         assert main(["export", str(run_dir), *options, "--out", str(out_dir)]) == 0
 
     export("--policy", "baseline-1")
-    exported, original = (jaxnav.load_policy(folder) for folder in (out_dir, run_dir / POLICIES_DIR / "baseline-1"))
-    chex.assert_trees_all_equal(exported, original)
+    original_policy = jaxnav.load_policy(run_dir / POLICIES_DIR / "baseline-1")
+    chex.assert_trees_all_equal(jaxnav.load_policy(out_dir), original_policy)
     assert "no layout weights" in (out_dir / "README.md").read_text()
 
-    # An export in another format leaves nothing of the one before.
+    # An export in another format removes all files of the earlier export.
     export("--policy", "baseline-0")
     export("--format", "stablehlo")
     assert set(contents(out_dir)) == {"README.md", "step.stablehlo", "step.json"}
     export("--policy", "baseline-0")
-    params_name = "params.safetensors"
-    assert contents(out_dir)[params_name] == contents(run_dir / POLICIES_DIR / "baseline-0")[params_name]
+    original_params = run_dir / POLICIES_DIR / "baseline-0" / "params.safetensors"
+    assert contents(out_dir)["params.safetensors"] == original_params.read_bytes()
 
 
 @pytest.mark.parametrize(
-    ("options", "mend"),
+    ("options", "advice"),
     [
         (["--policy", "layout-9"], "has baseline-0, baseline-1, layout-0, layout-1"),
         (["--out", "."], "give another --out"),
@@ -223,14 +242,18 @@ def test_export_command_copies_policies_and_replaces_earlier_exports(drawn_run, 
         (["--out", "file/out"], "cannot be written"),
     ],
 )
-def test_export_refuses_unknown_policies_and_foreign_folders(drawn_run, tmp_path, monkeypatch, capsys, options, mend):
+def test_export_refuses_unknown_policies_and_foreign_folders(drawn_run, tmp_path, monkeypatch, capsys, options, advice):
     run_dir = drawn_run.config.run_dir.absolute()
+
+    # A working directory with a file, and with a folder of another project.
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "README.md").write_text("a project of one's own")
+
+    # The refused export changes nothing.
     assert main(["export", str(run_dir), *options]) == 2
-    assert mend in refusal(capsys)
+    assert advice in refusal(capsys)
     assert contents(tmp_path) == {"file": b"", "mine/README.md": b"a project of one's own"}
 
 

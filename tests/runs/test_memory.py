@@ -1,4 +1,4 @@
-"""Memory that a run needs: read from the system, compared before arrays are created, and close to what they take."""
+"""Free memory of the system, the memory that a run needs, and the refusal of runs that need more than is free."""
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ GIB = 2**30
 
 @pytest.fixture
 def machine(tmp_path, monkeypatch):
-    """A machine with 8 GiB available, whose control groups a test may describe."""
+    """Folder that describes a machine with 8 GiB of available memory; a test may add control groups."""
     (tmp_path / "meminfo").write_text("MemTotal:       16777216 kB\nMemAvailable:    8388608 kB\n")
     monkeypatch.setattr(memory, "_MEMINFO", tmp_path / "meminfo")
     monkeypatch.setattr(memory, "_GROUPS_OF_PROCESS", tmp_path / "cgroup")
@@ -30,6 +30,7 @@ def machine(tmp_path, monkeypatch):
 
 
 def write_group(folder, files):
+    """Write the files of a control group."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in files.items():
         (folder / name).write_text(f"{text}\n")
@@ -46,8 +47,8 @@ def test_free_memory_is_the_lesser_of_machine_and_control_group(machine, limit, 
     assert memory.read_free_bytes() == expected
 
 
-def test_a_group_is_limited_by_the_groups_that_contain_it(machine):
-    """The job may use 4 GiB, of which 1 is used; its step has no limit of its own."""
+def test_group_is_limited_by_the_groups_that_contain_it(machine):
+    """The job may use 4 GiB, of which 1 GiB is used; its step has no limit of its own."""
     (machine / "cgroup").write_text("0::/slurm/job_7/step_0\n")
     job = machine / "groups" / "slurm" / "job_7"
     write_group(job, {"memory.max": 4 * GIB, "memory.current": GIB})
@@ -82,7 +83,7 @@ def test_free_memory_is_unknown_where_the_system_does_not_say(machine, meminfo):
     ("device_stats", "expected"),
     [({"bytes_limit": 5 * GIB, "bytes_in_use": GIB}, 4 * GIB), ({}, None), (None, None)],
 )
-def test_free_memory_of_an_accelerator_is_its_own(machine, monkeypatch, device_stats, expected):
+def test_free_memory_of_an_accelerator_is_that_of_the_device(machine, monkeypatch, device_stats, expected):
     class Accelerator:
         def memory_stats(self):
             return device_stats
@@ -92,7 +93,7 @@ def test_free_memory_of_an_accelerator_is_its_own(machine, monkeypatch, device_s
     assert memory.read_free_bytes() == expected
 
 
-def test_require_memory_names_need_supply_and_remedy(machine):
+def test_require_memory_names_needed_memory_free_memory_and_advice(machine):
     memory.require_memory(8 * GIB, "a run", "give less")
     with pytest.raises(InputError, match=r"a run needs 9\.0 GB of memory, but 8\.6 GB are free; give less"):
         memory.require_memory(9_000_000_000, "a run", "give less")
@@ -101,7 +102,7 @@ def test_require_memory_names_need_supply_and_remedy(machine):
 @pytest.mark.parametrize(
     ("num_bytes", "text"), [(0, "0 kB"), (1_500, "2 kB"), (2_000_000, "2 MB"), (1_234_000_000_000, "1,234.0 GB")]
 )
-def test_bytes_are_formatted_in_a_fitting_unit(num_bytes, text):
+def test_number_of_bytes_is_formatted_in_a_fitting_unit(num_bytes, text):
     assert memory.format_bytes(num_bytes) == text
 
 
@@ -113,13 +114,14 @@ def test_count_array_bytes_counts_arrays_and_random_keys():
 
 
 @pytest.mark.slow
-def test_estimated_states_have_the_size_of_the_states(tmp_path):
+def test_estimated_size_of_the_states_is_exact(tmp_path):
     config = tiny_config(tmp_path)
     compiled_world = compile_training_world(config, PlainConsole(quiet=True))
     estimator_config = ESTIMATORS["calibrated"]
     knowledge = learn_knowledge(config, compiled_world, explore_world(config, compiled_world), estimator_config)
     env_params = compiled_world.make_env_params(0)
     trainer = make_trainer(config, compiled_world.env, estimator_config, knowledge)
+
     num_bytes = trainer.estimate_state_bytes(env_params)
     assert num_bytes == count_array_bytes(trainer.init(env_params))
 
@@ -138,8 +140,8 @@ def test_estimated_states_have_the_size_of_the_states(tmp_path):
     ],
 )
 def test_training_is_refused_before_it_exceeds_the_memory(tmp_path, monkeypatch, free_before_each_check, message):
-    answers = iter(free_before_each_check)
-    monkeypatch.setattr(memory, "read_free_bytes", lambda: next(answers))
+    free_bytes = iter(free_before_each_check)
+    monkeypatch.setattr(memory, "read_free_bytes", lambda: next(free_bytes))
     config = tiny_config(tmp_path)
     with pytest.raises(InputError, match=message):
         jaxnav.train(config)

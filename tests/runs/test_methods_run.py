@@ -1,4 +1,4 @@
-"""Methods from training to evaluation, export and action; those with more to show are tested beside that."""
+"""Each method from training to evaluation and export; `belief`, custom edges and macro steps have further tests."""
 
 import dataclasses
 
@@ -20,45 +20,48 @@ SMALL_VTNET = {"token_width": 8, "feedforward": 8, "encoder_layers": 1, "decoder
 SIZES = {"vtnet": SMALL_VTNET, "tpn": {"tentative_width": 8}}
 
 
-def config_of(method, folder):
-    """Settings of a run of two chunks of a method, one of each of its stages."""
+def make_config(method, folder):
+    """Settings of a run of a method with two chunks; methods of two stages have one chunk for each stage."""
     sizes = SIZES.get(method, {})
     config = dataclasses.replace(tiny_config(folder), method=method, method_sizes=sizes, seeds=1, validations=0)
-    worlds = dataclasses.replace(config.worlds, num_train=16)  # among them rooms as large as those of val, for maps
+    # Among 16 training rooms are some as large as the rooms of val, which maps need.
+    worlds = dataclasses.replace(config.worlds, num_train=16)
     config = dataclasses.replace(config, arms=("baseline",), worlds=worlds)
     if any(stage.uses_expert for stage in find_method(method).stages):
-        config = dataclasses.replace(config, imitation=0.5)  # a chunk for each stage
+        config = dataclasses.replace(config, imitation=0.5)
     return config
 
 
 @pytest.mark.parametrize("method", params_by_tier(["rgb", "sp", "savn", "eotp", "tpn", "vtnet", "hoz", "semexp"]))
 def test_method_is_trained_exported_and_evaluated(method, tmp_path):
-    """The exported policy is that of the run, with the same knowledge."""
-    run = train(config_of(method, tmp_path / "one"))
-    folder = run.config.run_dir
-    assert main(["export", str(folder), "--policy", "baseline-0", "--out", str(tmp_path / "out")]) == 0
-    exported = jaxnav.load_policy(tmp_path / "out")
-    chex.assert_trees_all_equal(exported, jaxnav.load_policy(folder / "policies" / "baseline-0"))
-    assert bool(exported.knowledge.method) == (find_method(method).learn is not None)
+    """The exported policy equals the policy of the run, including its knowledge."""
+    run = train(make_config(method, tmp_path / "run"))
+    run_dir = run.config.run_dir
+    assert main(["export", str(run_dir), "--policy", "baseline-0", "--out", str(tmp_path / "out")]) == 0
+    exported_policy = jaxnav.load_policy(tmp_path / "out")
+    chex.assert_trees_all_equal(exported_policy, jaxnav.load_policy(run_dir / "policies" / "baseline-0"))
+    assert bool(exported_policy.knowledge.method) == (find_method(method).learn is not None)
 
     results = jaxnav.evaluate(run, episodes=8)
     assert {leaf.shape[-1] for leaf in results.outcome} == {8}
-    assert main(["export", str(folder), "--format", "stablehlo", "--out", str(tmp_path / "step")]) == 0
+    assert main(["export", str(run_dir), "--format", "stablehlo", "--out", str(tmp_path / "step")]) == 0
 
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("method", ["savn", "hoz", "semexp"])
 def test_method_with_tracker_state_resumes_bit_for_bit(method, tmp_path, monkeypatch):
-    """Fast weights, zones and maps are in the checkpoint; those of several stages are resumed in `test_budget`."""
-    config = config_of(method, tmp_path / "one")
-    whole = train(config)
-    resumed = train_in_two(dataclasses.replace(config, run_dir=tmp_path / "two"), monkeypatch)
-    assert resumed.log() == whole.log()
-    runs = [jaxnav.load_policy(run.config.run_dir / "policies" / "baseline-0") for run in (whole, resumed)]
-    chex.assert_trees_all_equal(*runs)
+    """Checkpoints hold fast weights, zones and maps; `test_budget` resumes runs of methods with two stages."""
+    config = make_config(method, tmp_path / "uninterrupted")
+    run = train(config)
+    resumed_run = train_in_two(dataclasses.replace(config, run_dir=tmp_path / "resumed"), monkeypatch)
+    assert resumed_run.log() == run.log()
+    policy = jaxnav.load_policy(run.config.run_dir / "policies" / "baseline-0")
+    resumed_policy = jaxnav.load_policy(resumed_run.config.run_dir / "policies" / "baseline-0")
+    chex.assert_trees_all_equal(policy, resumed_policy)
 
 
-PRIORS = """
+#: Module with a variant of the method `sp`, whose graph is read from a file of edges.
+PRIORS_MODULE = """
 import dataclasses, functools
 from jaxnav.policies.methods import METHODS
 from jaxnav.policies.methods.sp import graph_from_file
@@ -69,20 +72,25 @@ PRIORS = dataclasses.replace(METHODS["sp"], learn=functools.partial(graph_from_f
 
 @pytest.mark.exhaustive
 def test_custom_edges_must_match_the_categories_of_the_world(tmp_path, monkeypatch, capsys):
-    (tmp_path / "my_priors.py").write_text(PRIORS)
-    (tmp_path / "edges.csv").write_text("Mug,DiningTable")  # which rooms do not know
+    (tmp_path / "my_priors.py").write_text(PRIORS_MODULE)
+    (tmp_path / "edges.csv").write_text("Mug,DiningTable")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
+
+    # Rooms have none of these categories.
     method = "my_priors:PRIORS"
-    config = dataclasses.replace(tiny_config(tmp_path / "one"), method=method, method_sizes={}, seeds=1, validations=0)
+    config = dataclasses.replace(tiny_config(tmp_path / "run"), method=method, method_sizes={}, seeds=1, validations=0)
     with pytest.raises(InputError, match=r"fails check_method \(InputError: edges.csv:1: category 'Mug' is unknown"):
         train(config)
+
+    # Apartments have both: the edge and the loop of the node weigh a half each, and every row sums up to 1.
     worlds = dataclasses.replace(config.worlds, num_train=2)
     config = dataclasses.replace(config, world="apartments", arms=("baseline",), worlds=worlds, total_steps=256)
-    learned = train(config).policies().knowledge.method["mixing"]
-    edge = [config.task.categories.index(name) for name in ("Mug", "DiningTable")]
-    assert learned[edge[0], edge[1]] == 0.5  # one of two: the edge and the loop
-    assert float(learned.sum()) == len(learned)
+    mixing = train(config).policies().knowledge.method["mixing"]
+    mug = config.task.categories.index("Mug")
+    dining_table = config.task.categories.index("DiningTable")
+    assert mixing[mug, dining_table] == 0.5
+    assert float(mixing.sum()) == len(mixing)
 
 
 @pytest.mark.parametrize(("rollout", "is_warned"), [(24, True), (25, False)])
@@ -97,33 +105,38 @@ def test_train_warns_of_rollouts_shorter_than_a_macro_step(rollout, is_warned, t
 
 @pytest.mark.exhaustive
 def test_belief_is_fitted_exported_swept_and_evaluated(tmp_path):
-    """The fit takes the place of training, and is read by a repeated command."""
+    """Method `belief` is fitted instead of trained, and a repeated command reads the fit."""
     config = tiny_config(tmp_path)
     worlds = dataclasses.replace(config.worlds, num_train=16)
     config = dataclasses.replace(config, method="belief", method_sizes={}, arms=ARMS, worlds=worlds, validations=1)
     run = train(config)
-    folder = run.config.run_dir
+    run_dir = run.config.run_dir
     assert run.config.arms == ("layout",)
     estimator_config = run.policies().estimator_config
     assert estimator_config is not None
     assert estimator_config.form == "paper"
     assert run.config.steps_by_purpose == {"exploration": 64 * 20, "searches": 512}
     assert run.success_by_budget() is not None
-    policies = [jaxnav.load_policy(folder / "policies" / f"layout-{seed}") for seed in range(2)]
+
+    # Seeds share their knowledge, and differ in their fits.
+    policies = [jaxnav.load_policy(run_dir / "policies" / f"layout-{seed}") for seed in range(2)]
     chex.assert_trees_all_equal(policies[0].knowledge, policies[1].knowledge)
     assert (policies[0].params["method"]["relations"] != policies[1].params["method"]["relations"]).any()
 
     # A repeated command reads the fit, and exports it again.
-    before = (folder / "policies" / "layout-1" / "params.safetensors").read_bytes()
+    params_file = run_dir / "policies" / "layout-1" / "params.safetensors"
+    params_before = params_file.read_bytes()
     train(config)
-    assert (folder / "policies" / "layout-1" / "params.safetensors").read_bytes() == before
+    assert params_file.read_bytes() == params_before
 
-    # Without removal a sweep gives the complete belief; the program of a step is exported.
+    # A sweep has two thresholds and two seeds; without removal, at epsilon 1, the agent acts by its complete belief.
     sweep = jaxnav.sweep(run, epsilon=[0.0, 1.0], episodes=8)
     assert sweep.sr.shape[:2] == (2, 2)
+
+    # The run can be evaluated, and the program of a step can be exported.
     results = jaxnav.evaluate(run, episodes=8)
     assert {leaf.shape[-1] for leaf in results.outcome} == {8}
-    assert main(["export", str(folder), "--format", "stablehlo", "--out", str(tmp_path / "step")]) == 0
+    assert main(["export", str(run_dir), "--format", "stablehlo", "--out", str(tmp_path / "step")]) == 0
 
 
 @pytest.mark.parametrize(
@@ -137,4 +150,6 @@ def test_belief_has_one_arm_and_one_decision(settings, problem):
     with pytest.raises(InputError, match=problem):
         check_config(RunConfig(method="belief", **settings))
     config = check_config(RunConfig(method="belief"))
-    assert (config.arms, config.total_steps, config.spatial_memory) == (("layout",), FITTED_STEPS, False)
+    assert config.arms == ("layout",)
+    assert config.total_steps == FITTED_STEPS
+    assert not config.spatial_memory

@@ -1,4 +1,4 @@
-"""What the header of `paper.yaml` claims: equations 3 to 7 to the letter, networks of the released code in size."""
+"""Claims in the header of `paper.yaml`: equations 3 to 7 to the letter, and networks as large as the released code."""
 
 import dataclasses
 import functools
@@ -44,6 +44,7 @@ RELEASED_PARAMETERS = {
     "heads": 512 * 6 + 6 + 512 * 64 + 64 + 64 + 1,
     "action": 6 * 10 + 10,
 }
+#: Modules of the network in each part.
 PARTS = {
     "core": ("fuse", "core"),
     "view": ("view",),
@@ -55,7 +56,7 @@ PARTS = {
 
 
 def load_config(name: str, **changes: Any) -> RunConfig:
-    """Return a packaged configuration as training completes it."""
+    """Return a packaged configuration with changes, completed as in training."""
     return check_config(dataclasses.replace(apply_yaml(RunConfig(), name), **changes))
 
 
@@ -64,7 +65,7 @@ def load_config(name: str, **changes: Any) -> RunConfig:
 
 @dataclasses.dataclass(frozen=True)
 class PaperWorld:
-    """Few training scenes, and all that a run of `--config paper` learns in them before training."""
+    """Few training scenes, and the knowledge that a run of `--config paper` learns in them before training."""
 
     config: RunConfig
     bank: Bank
@@ -78,19 +79,24 @@ class PaperWorld:
 
 @functools.cache
 def paper_world() -> PaperWorld:
+    # Four scenes, and 24 walks of 40 steps.
     config = apply_yaml(RunConfig(), "paper")
     layout = dataclasses.replace(config.layout, walks=24, steps=40)
     worlds = dataclasses.replace(config.worlds, num_train=4)
     config = check_config(dataclasses.replace(config, layout=layout, worlds=worlds))
+
+    # Compile, explore and learn as `train` does.
     console = PlainConsole(quiet=True)
     compiled_world = compile_training_world(config, console)
     exploration = training.explore_world(config, compiled_world)
     estimator = training.calibrate_estimator(config, compiled_world, exploration, console)
     knowledge = training.learn_knowledge(config, compiled_world, exploration, estimator)
 
-    # The random walks: starts and actions by the keys of the run.
-    run_key = jax.random.fold_in(jax.random.key(config.seed), training._EXPLORE)
-    start_key, action_key = (jax.random.fold_in(jax.random.fold_in(run_key, 0), purpose) for purpose in (0, 1))
+    # Repeat the random walks: starts and actions are drawn by the keys of the run.
+    explore_key = jax.random.fold_in(jax.random.key(config.seed), training._EXPLORE)
+    bank_key = jax.random.fold_in(explore_key, 0)
+    start_key = jax.random.fold_in(bank_key, 0)
+    action_key = jax.random.fold_in(bank_key, 1)
     env_params = compiled_world.make_env_params(0)
     _, state = jax.vmap(compiled_world.env.reset, (0, None))(jax.random.split(start_key, 24), env_params)
     actions = np.asarray(jax.random.randint(action_key, (40, 24), 0, DONE))
@@ -103,13 +109,15 @@ def paper_world() -> PaperWorld:
 
 
 def instance_counts(row: np.ndarray) -> np.ndarray:
-    """Return the counts of a row: behind four bytes a category and a view of 31 bytes."""
+    """Return the counts of a row, which follow four bytes per category and a view of 31 bytes."""
     return row[4 * NUM_CATEGORIES + 31 :][:NUM_CATEGORIES].astype(np.int64)
 
 
 @pytest.mark.slow
-def test_prior_is_one_for_all_rooms_from_ones_and_every_view_of_the_walks():
+def test_all_rooms_share_a_prior_of_ones_plus_the_counts_of_every_view():
     world = paper_world()
+
+    # Ones, plus the instance counts of every view to the row of each category that it shows.
     alpha = np.ones((NUM_CATEGORIES, NUM_CATEGORIES))
     pose = world.start_poses
     for step_actions in (None, *world.actions):
@@ -130,7 +138,7 @@ def test_prior_is_one_for_all_rooms_from_ones_and_every_view_of_the_walks():
 @pytest.mark.slow
 @pytest.mark.parametrize("prior_kind", ["of the run", "ones"])
 def test_belief_gap_and_weights_follow_equations_3_to_7(prior_kind):
-    """A random sequence of views in float64; after few sightings (`ones`) the gaps are large."""
+    """The belief follows a twin in float64 along random views; after few sightings (`ones`) the gaps are large."""
     world = paper_world()
     rng = np.random.default_rng(0)
     prior = world.knowledge.layout[0]
@@ -141,10 +149,12 @@ def test_belief_gap_and_weights_follow_equations_3_to_7(prior_kind):
 
     update = jax.jit(world.perception.update)
     read_inputs = jax.jit(world.perception.policy_inputs)
-    room, zero = jnp.int32(1), jnp.int32(0)
+    room = jnp.int32(1)
+    zero = jnp.int32(0)
     state = world.perception.init(knowledge, room)
     gaps = []
-    for pose in np.repeat(rng.integers(0, len(world.bank.rows), 20), 2):  # each view twice: a repetition counts again
+    # Each view occurs twice in a row, because a repetition counts again.
+    for pose in np.repeat(rng.integers(0, len(world.bank.rows), 20), 2):
         row = jnp.asarray(world.bank.rows[pose])
         goal = jnp.int32(rng.integers(NUM_CATEGORIES))
         percept = Percept(row, heading=zero, action=zero, moved=jnp.bool_(False), horizon=zero, goal=goal)
@@ -166,19 +176,25 @@ def test_belief_gap_and_weights_follow_equations_3_to_7(prior_kind):
 
 @pytest.mark.slow
 def test_weights_multiply_the_rows_of_experience_unscaled():
-    """Equation 7: the experience of the policy is that of its method with raw weights."""
+    """Equation 7: the policy encodes its experience by its method, with raw weights."""
     world = paper_world()
     spec = load_config("paper_small").policy_spec(NUM_CATEGORIES)
     policy = bind(spec, init_params(spec, jax.random.key(0)))
-    row = jnp.asarray(world.bank.rows[int(np.argmax((world.bank.rows[:, : 4 * NUM_CATEGORIES : 4] > 0).sum(1)))])
+
+    # The row with most detections, and random weights of at most 0.2 except for the goal.
+    num_detections = (world.bank.rows[:, : 4 * NUM_CATEGORIES : 4] > 0).sum(1)
+    row = jnp.asarray(world.bank.rows[int(np.argmax(num_detections))])
     goal = jnp.int32(3)
     weights = jax.random.uniform(jax.random.key(1), (NUM_CATEGORIES,), maxval=0.2).at[goal].set(1.0)
+
     pathways = policy.encode(PolicyInputs(Observation(row, goal), weights))
     features = unpack_features(row, goal, world.perception.row_format)
     expected = policy.experience.encode(features, policy.experience_appearance, weights, None)
     np.testing.assert_array_equal(pathways.experience, expected)
-    doubled = policy.experience.encode(features, policy.experience_appearance, 2 * weights, None)
-    assert np.abs(doubled - expected).max() > 1e-3
+
+    # Other weights give another experience.
+    doubled_experience = policy.experience.encode(features, policy.experience_appearance, 2 * weights, None)
+    assert np.abs(doubled_experience - expected).max() > 1e-3
 
 
 # Networks
@@ -203,7 +219,8 @@ def test_network_is_of_the_released_size_by_part():
     # Rows of detections and of the experience: relations differ by biases, and rows by three columns.
     for part in ("detections", "method"):
         assert counts[part] == pytest.approx(RELEASED_PARAMETERS[part], rel=0.02)
-    # The core with its input layer and the layer of the view, which the release has as one convolution each.
+
+    # The core with its input layer and the layer of the view; in the release each of these layers is a convolution.
     released_core = RELEASED_PARAMETERS["core"] + RELEASED_PARAMETERS["view"]
     assert counts["core"] + counts["view"] == pytest.approx(released_core, rel=0.01)
     assert counts["categories"] < 0.003 * 9_801_791
@@ -217,7 +234,8 @@ def test_header_of_the_configuration_states_the_counts():
         assert f"{number:,}" in header
     for number in (*RELEASED_PARAMETERS.values(), 9_801_791):
         assert f"{number:,}" in header or number == RELEASED_PARAMETERS["action"]
-    assert f"{sum(count_parameters(load_config('paper_small')).values()):,}" in CONFIGS["paper_small"].read_text()
+    small_total = sum(count_parameters(load_config("paper_small")).values())
+    assert f"{small_total:,}" in CONFIGS["paper_small"].read_text()
 
 
 # The other settings
@@ -225,7 +243,8 @@ def test_header_of_the_configuration_states_the_counts():
 
 @pytest.mark.parametrize("world", ["rooms", "apartments", "houses"])
 def test_every_world_has_the_papers_reward(world):
-    config = check_config(fill_world_defaults(dataclasses.replace(apply_yaml(RunConfig(), "paper"), world=world)))
+    paper_config = dataclasses.replace(apply_yaml(RunConfig(), "paper"), world=world)
+    config = check_config(fill_world_defaults(paper_config))
     assert (config.worlds.shaping, config.near_starts, config.ppo.guidance) == (0, 0, 0)
     assert not config.ppo.has_guidance
     assert config.ppo.experience == 1.0  # no episodes without experience
@@ -233,21 +252,21 @@ def test_every_world_has_the_papers_reward(world):
 
 
 def test_rewards_are_those_of_the_paper():
-    world = paper_world()
-    assert (float(world.env_params.success_reward), float(world.env_params.step_reward)) == (5.0, np.float32(-0.01))
+    env_params = paper_world().env_params
+    assert (float(env_params.success_reward), float(env_params.step_reward)) == (5.0, np.float32(-0.01))
 
 
-def test_estimator_is_the_named_one():
+def test_estimator_is_paper():
     assert paper_world().estimator == ESTIMATORS["paper"]
 
 
 @pytest.mark.parametrize("name", ["paper_small", "paper_vtnet"])
-def test_smaller_configurations_keep_the_letter(name):
-    sizes_of_paper = {"method": "org", "sizes": load_config("paper").sizes, "method_sizes": {"relation_layers": 4}}
-    rate_of_paper = load_config("paper").ppo.learning_rate
+def test_other_paper_configurations_differ_only_in_sizes_and_learning_rate(name):
+    paper_config = load_config("paper")
     config = load_config(name)
-    ppo = dataclasses.replace(config.ppo, learning_rate=rate_of_paper)
-    assert dataclasses.replace(config, ppo=ppo, **sizes_of_paper) == load_config("paper")
+    ppo = dataclasses.replace(config.ppo, learning_rate=paper_config.ppo.learning_rate)
+    paper_sizes = {"method": "org", "sizes": paper_config.sizes, "method_sizes": {"relation_layers": 4}}
+    assert dataclasses.replace(config, ppo=ppo, **paper_sizes) == paper_config
     assert config.worlds == WorldConfig(shaping=0, near_starts=0, front_cell="nearest")
 
 
@@ -256,7 +275,7 @@ def test_smaller_configurations_keep_the_letter(name):
 
 @pytest.fixture(scope="module")
 def counting_run(tmp_path_factory) -> Run:
-    """A run of tiny policies whose estimator is `paper`, with weak rows of the prior."""
+    """Run of tiny policies whose estimator is `paper`, with weak rows of the prior."""
     layout = LayoutConfig(setting="paper", prior="pooled", walks=64, steps=20)
     config = check_config(tiny_config(tmp_path_factory.mktemp("counting"), layout=layout))
     return draw_run(config, dataclasses.replace(ESTIMATORS["paper"], strength=5.0))
@@ -266,6 +285,8 @@ def test_exported_policy_follows_the_belief_with_counts(counting_run):
     folder = counting_run.config.run_dir / POLICIES_DIR / "layout-0"
     policy = jaxnav.load_policy(folder)
     assert policy.task.instance_counts
+
+    # The belief follows its twin along four views, of which the second occurs twice.
     twin = TwinPaperBelief(np.asarray(policy.knowledge.layout[0]))
     memory = policy.init("kitchen")
     rows = paper_world().bank.rows
@@ -279,7 +300,7 @@ def test_exported_policy_follows_the_belief_with_counts(counting_run):
         np.testing.assert_allclose(output.gap, twin.gap, rtol=1e-4, atol=1e-6)
         np.testing.assert_allclose(output.weights, twin.weights(2), rtol=1e-5)
 
-    # A program gets the counts as an array of their own, and a run configuration counts instances, too.
+    # A program gets the counts as a separate array, and the task of the configuration counts instances.
     assert input_shapes(policy, 1)["counts"].shape == (1, NUM_CATEGORIES)
     assert config_for_policy(folder).task == policy.task
 
@@ -290,13 +311,14 @@ def test_policy_that_counts_instances_refuses_rows_without_counts(counting_run):
     with pytest.raises(InputError, match=r"instance_counts.*make an environment with the task of the policy"):
         jaxnav.load_policy(folder, env=plain_env)
     assert jaxnav.load_policy(folder, env=ObjectNav(Task(instance_counts=True))).task.instance_counts
-    # Its baseline has no belief and reads rows of both kinds.
+
+    # The baseline has no belief and reads rows of both kinds.
     baseline = jaxnav.load_policy(counting_run.config.run_dir / POLICIES_DIR / "baseline-0", env=plain_env)
     assert baseline.estimator_config is None
 
 
 @pytest.mark.slow
-def test_evaluations_by_the_paper_count_what_the_rows_hold(counting_run, drawn_run):
+def test_paper_estimator_counts_instances_where_rows_hold_them_and_else_presence(counting_run, drawn_run):
     assert counting_run.policies().with_estimator("paper").estimator_config == ESTIMATORS["paper"]
     presence = dataclasses.replace(ESTIMATORS["paper"], counts="presence")
     assert drawn_run.policies().with_estimator("paper").estimator_config == presence

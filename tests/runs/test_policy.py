@@ -1,4 +1,4 @@
-"""A loaded policy acts as in the evaluation, step by step and in batches."""
+"""Loaded policies act as in the evaluation, step by step and in batches."""
 
 import dataclasses
 import functools
@@ -31,12 +31,12 @@ from jaxnav.scenes.tables.observation_row import Detector
 from jaxnav.scenes.task import APARTMENTS
 
 _compiled_act = jax.jit(LoadedPolicy.act)
-#: Actions of an episode in which a policy adapts twice.
+#: Step limit of an episode in which a policy adapts twice.
 LONG_EPISODE = 15
 
 
 def act(policy, observation, memory, epsilon=0.1, *, key=None, heading=0, moved=False, horizon=0):
-    """Return the action and the memory after one step; a kind of policy is compiled once."""
+    """Return the action and the memory after one step; policies of equal structure share a compilation."""
     odometry = {"heading": jnp.int32(heading), "moved": jnp.bool_(moved), "horizon": jnp.int32(horizon)}
     return _compiled_act(policy, observation, memory, jnp.float32(epsilon), key=key, **odometry)
 
@@ -101,11 +101,14 @@ def test_loaded_policy_acts_as_in_the_evaluation(drawn_run, world, variant, epsi
     arm = "baseline" if variant == "baseline" else "layout"
     seed = 1
     policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES_DIR / f"{arm}-{seed}")
+
+    # The policies of the run, as the evaluation plays them.
     policies = drawn_run.policies()
     agent_loop = policies.make_agent_loop(world)
     weights = tiny.leaves_at(policies.arm_params(arm), seed)
     cell = select_cell(variant, epsilon, decoding)
-    key = jax.random.fold_in(jax.random.key(0), 0) if decoding == "sample" else None  # that of the first episode played
+    first_episode_key = jax.random.fold_in(jax.random.key(0), 0)
+    key = first_episode_key if decoding == "sample" else None
     env_params = world.make_env_params(0)
     bank = world.banks[0]
     episodes = draw_episodes(bank, 8)
@@ -123,9 +126,11 @@ def test_loaded_policy_acts_as_in_the_evaluation(drawn_run, world, variant, epsi
 @pytest.mark.slow
 @pytest.mark.parametrize("setting", ["overdue", "learned"])
 def test_handover_policy_switches_as_in_the_evaluation(drawn_run, world, setting):
-    """The policy switches and holds: once without experience, always without."""
+    """With `hold`, a policy that has switched to decisions without experience keeps them to the end of the episode."""
     epsilon = 0.6
     policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES_DIR / "layout-1", setting, hold=True, form="switch")
+
+    # The policies of the run, as the evaluation plays them.
     policies = drawn_run.policies().with_estimator(setting, hold=True)
     agent_loop = policies.make_agent_loop(world)
     weights = tiny.leaves_at(policies.arm_params("layout"), 1)
@@ -157,10 +162,14 @@ def test_loaded_policy_actions_depend_on_epsilon_and_key(drawn_run, world):
     room_type = bank.room_types[int(starts.scene[0])]
     start = tiny.leaves_at(starts, 0)
     act_twelve_times = functools.partial(roll_out, policy, world.env, world.make_env_params(0), start, room_type, 12)
+
+    # Actions are repeatable.
     assert act_twelve_times(epsilon=0.0) == act_twelve_times(epsilon=0.0)
     first_key = jax.random.key(0)
     second_key = jax.random.key(1)
     assert act_twelve_times(key=first_key) == act_twelve_times(key=first_key)
+
+    # Best actions at another epsilon and sampled actions of two keys all differ.
     action_lists = [
         act_twelve_times(epsilon=1.0),
         act_twelve_times(key=first_key),
@@ -173,7 +182,7 @@ def test_loaded_policy_actions_depend_on_epsilon_and_key(drawn_run, world):
 
 
 def sample_mid_episode(policy, env, params, num_samples=6):
-    """Return lists of observations and memories after one step from random poses, in turn of every room type."""
+    """Return lists of observations and memories after one step from random poses, with the room types in turn."""
     observations = []
     memories = []
     room_types = [*ROOM_TYPES, None]
@@ -187,6 +196,7 @@ def sample_mid_episode(policy, env, params, num_samples=6):
 
 
 def stack(trees):
+    """Return trees as one tree, whose leaves have a leading axis."""
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
 
 
@@ -196,7 +206,8 @@ def test_vmapped_observations_equal_single_steps(drawn_run, world, name):
     policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES_DIR / name)
     observations, memories = sample_mid_episode(policy, world.env, world.make_env_params(0))
     act_in_place = functools.partial(policy.act, heading=0, moved=False)
-    batched = jax.jit(jax.vmap(act_in_place, (0, 0, None)))(stack(observations), stack(memories), 0.1)
+    batched_act = jax.jit(jax.vmap(act_in_place, (0, 0, None)))
+    batched = batched_act(stack(observations), stack(memories), 0.1)
     singles = stack([act(policy, *pair) for pair in zip(observations, memories, strict=True)])
     np.testing.assert_array_equal(batched[0], singles[0])
     chex.assert_trees_all_close(batched, singles, rtol=1e-5, atol=1e-6)
@@ -259,17 +270,17 @@ def test_load_policy_refuses_an_environment_of_another_task(drawn_run, world):
 
 @dataclasses.dataclass(frozen=True)
 class OdometryTracker:
-    """Tracker of headings, moves and actions, each step weighing half as much as the next."""
+    """Tracker of headings, moves and actions, in which each step weighs half as much as the next."""
 
     def init(self, knowledge):
         return jnp.zeros(3)
 
-    def update(self, note, knowledge, percept):
+    def update(self, tracker_state, knowledge, percept):
         odometry = [jnp.float32(value) for value in (percept.heading, percept.moved, percept.action)]
-        return 0.5 * note + jnp.stack(odometry)
+        return 0.5 * tracker_state + jnp.stack(odometry)
 
-    def read(self, note, knowledge, goal):
-        return note
+    def read(self, tracker_state, knowledge, goal):
+        return tracker_state
 
 
 class TrackerExperience(Experience):
@@ -294,17 +305,18 @@ def draw_reluctant_params(spec):
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("name", ["semexp", "savn", "tpn"])
 def test_loaded_adaptive_or_controlled_policy_acts_as_in_the_evaluation(name):
-    """Both agree on the logits of a whole episode, longer than a window of six actions, so adaptation changes them."""
+    """Logits agree over an episode that is longer than a window of six actions, so that adaptation changes them."""
     method = METHODS[name]
     estimator = tiny.ESTIMATOR if method.hosts_layout else None
     spec = dataclasses.replace(tiny.SPEC, method=method, method_sizes=())
     env, env_params = tiny.world()
     env_params = env_params.replace(step_limit=jnp.full(2, LONG_EPISODE, jnp.int32))
-    params = (
-        draw_reluctant_params(spec) if method.control.num_choices == env.num_actions else tiny.random_params(2, spec)
-    )
+    if method.control.num_choices == env.num_actions:
+        params = draw_reluctant_params(spec)
+    else:
+        params = tiny.random_params(2, spec)
 
-    # What the method learns before training, from the tiny world.
+    # Knowledge that the method learns in the tiny world before training.
     learned = {}
     if method.learn is not None:
         learned = method.learn([tiny.BANK], np.ones(tiny.knowledge().layout.shape))
@@ -319,7 +331,7 @@ def test_loaded_adaptive_or_controlled_policy_acts_as_in_the_evaluation(name):
     (trace,) = play(agent_loop=AgentLoop(env, spec, estimator))
     assert len(trace.action) > WINDOW
 
-    # The loaded policy along the same actions.
+    # The loaded policy along these actions.
     policy = LoadedPolicy(params, knowledge, spec, estimator, env.task)
     decide = jax.jit(LoadedPolicy.decide)
     memory = policy.init("kitchen")
@@ -357,7 +369,7 @@ def test_loaded_tracker_is_updated_at_every_step():
     num_steps = len(trace.action)
     assert num_steps == tiny.STEP_LIMITS[0]
 
-    # The loaded policy needs the odometry to act so.
+    # The loaded policy acts like that only with odometry.
     policy = LoadedPolicy(params, knowledge, spec, tiny.ESTIMATOR, env.task)
     walk = functools.partial(roll_out, policy, env, env_params, start, "kitchen", num_steps, epsilon=0.1)
     assert walk() == trace.action.tolist()

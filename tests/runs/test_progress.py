@@ -1,4 +1,4 @@
-"""What a training run prints about its progress and its length."""
+"""Progress bar, success and number of steps that a training run prints and logs."""
 
 import dataclasses
 import io
@@ -14,7 +14,7 @@ from jaxnav.store.files import append_log_rows, read_log_rows
 
 
 @pytest.mark.parametrize("num_skipped", [0, 12])
-def test_bar_and_both_times_fit_80_columns(num_skipped):
+def test_progress_bar_and_times_fit_80_columns(num_skipped):
     config = dataclasses.replace(RunConfig(), total_steps=5_000_000)  # four digits of updates
     metrics = [{"success": 0.876, "skipped_steps": num_skipped}]
     output = io.StringIO()
@@ -24,14 +24,14 @@ def test_bar_and_both_times_fit_80_columns(num_skipped):
         progress.show_chunk({"baseline": metrics, "layout": metrics}, config.total_updates - config.chunk)
 
     last_line = Text.from_ansi(output.getvalue()).plain.strip().splitlines()[-1]
-    words, bar, elapsed, remaining = last_line.rsplit(maxsplit=3)
-    assert words.startswith(f"{config.total_updates - config.chunk}/{config.total_updates}")
-    assert num_skipped or "layout 88 %" in words
+    description, bar, elapsed_time, remaining_time = last_line.rsplit(maxsplit=3)
+    assert description.startswith(f"{config.total_updates - config.chunk}/{config.total_updates}")
+    assert num_skipped or "layout 88 %" in description
     assert len(bar) >= 10
-    assert [len(cell) for cell in (elapsed, remaining)] == [7, 7]
+    assert (len(elapsed_time), len(remaining_time)) == (7, 7)
 
 
-def test_success_without_an_episode_that_ended_is_undefined():
+def test_success_is_undefined_before_an_episode_has_ended():
     config = RunConfig()
     output = io.StringIO()
     metrics = {
@@ -45,10 +45,12 @@ def test_success_without_an_episode_that_ended_is_undefined():
 
 
 def test_means_over_no_episode_are_undefined_in_the_log(tmp_path):
-    """With episodes they stay as they are, and a loss is defined always."""
+    """Means over episodes are kept, and losses are always defined."""
     means = {"success": 0.0, "return": 0.0, "length": 0.0, "truncated": 0.0}
     metrics = {"layout": [means | {"episodes": 0.0, "loss": 1.0}, means | {"episodes": 3.0, "loss": 2.0}]}
-    rows = [{"step": seed} | row for seed, row in enumerate(mark_undefined_means(metrics)["layout"])]
+    rows = []
+    for seed, seed_metrics in enumerate(mark_undefined_means(metrics)["layout"]):
+        rows.append({"step": seed} | seed_metrics)
     append_log_rows(tmp_path / "metrics.jsonl", rows)
     assert read_log_rows(tmp_path / "metrics.jsonl") == [
         {"step": 0} | dict.fromkeys(means) | {"episodes": 0.0, "loss": 1.0},
@@ -56,13 +58,12 @@ def test_means_over_no_episode_are_undefined_in_the_log(tmp_path):
     ]
 
 
-def test_steps_beyond_those_asked_for_are_printed():
+def test_steps_beyond_the_requested_number_are_printed():
     chunk_steps = RunConfig().chunk * RunConfig().steps_per_update
     for total_steps, is_printed in ((chunk_steps, False), (chunk_steps - 1, False), (chunk_steps + 1, True)):
+        config = dataclasses.replace(RunConfig(), total_steps=total_steps)
         output = io.StringIO()
-        warn_if_more_steps(
-            dataclasses.replace(RunConfig(), total_steps=total_steps), PlainConsole(file=output, width=200)
-        )
+        warn_if_more_steps(config, PlainConsole(file=output, width=200))
         printed = output.getvalue()
         assert bool(printed) == is_printed
         assert not is_printed or f"{2 * chunk_steps:,}" in printed

@@ -1,4 +1,4 @@
-"""Runs whose policies decide in two streams: their settings, their exports, training and evaluation."""
+"""Runs whose policies decide in two streams: settings, exports, training and evaluation."""
 
 import dataclasses
 import shutil
@@ -21,33 +21,41 @@ from jaxnav.training.calibration import Exploration
 
 
 @pytest.fixture(scope="module")
-def streams(config):
-    # The default of `ppo.experience` depends on the decision.
+def stream_config(config):
+    """Settings of a run with streams, whose `ppo.experience` has the default of this decision."""
     ppo = dataclasses.replace(config.ppo, experience=None)
     return check_config(dataclasses.replace(config, decision="streams", ppo=ppo))
 
 
-def test_stream_config_disables_counterfactual_training(streams):
-    assert (streams.direct, streams.counterfactual) == ("goal", "none")
-    spec = streams.policy_spec(9)
+def test_stream_config_disables_counterfactual_training(stream_config):
+    assert (stream_config.direct, stream_config.counterfactual) == ("goal", "none")
+    spec = stream_config.policy_spec(9)
     assert (spec.decision, spec.direct) == ("streams", "goal")
-    fused = check_config(RunConfig())
-    assert (fused.decision, fused.direct, fused.counterfactual) == ("fused", "goal", "distil")
+    fused_config = check_config(RunConfig())
+    assert (fused_config.decision, fused_config.direct, fused_config.counterfactual) == ("fused", "goal", "distil")
 
 
 @pytest.mark.slow
-def test_exported_stream_policy_acts(drawn_run, streams, tmp_path):
-    drawn = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES_DIR / "layout-0")
-    params = random_params(0, streams.policy_spec(len(streams.task.categories)))
-    counts = jnp.ones_like(drawn.knowledge.layout)
-    explored = Exploration(counts, counts, jnp.int32(1), jnp.int32(1))
-    export_policy(tmp_path / "policy", streams, params, drawn.knowledge, drawn.estimator_config, explored)
-    policy = jaxnav.load_policy(tmp_path / "policy")
-    assert policy.spec == streams.policy_spec(len(streams.task.categories))
+def test_exported_stream_policy_acts(drawn_run, stream_config, tmp_path):
+    # Export random parameters with the knowledge of a drawn policy.
+    drawn_policy = jaxnav.load_policy(drawn_run.config.run_dir / POLICIES_DIR / "layout-0")
+    knowledge = drawn_policy.knowledge
+    spec = stream_config.policy_spec(len(stream_config.task.categories))
+    params = random_params(0, spec)
+    counts = jnp.ones_like(knowledge.layout)
+    exploration = Exploration(counts, counts, jnp.int32(1), jnp.int32(1))
+    policy_dir = tmp_path / "policy"
+    export_policy(policy_dir, stream_config, params, knowledge, drawn_policy.estimator_config, exploration)
+
+    policy = jaxnav.load_policy(policy_dir)
+    assert policy.spec == spec
     chex.assert_trees_all_equal(policy.params, params)
-    compiled_world = compile_evaluation_world(streams, "val", None, None, Console(quiet=True))
-    _, state = compiled_world.env.reset(jax.random.key(0), compiled_world.make_env_params(0))
-    observation = compiled_world.env.observe(state, compiled_world.make_env_params(0))
+
+    # The loaded policy acts in its world, with experience.
+    compiled_world = compile_evaluation_world(stream_config, "val", None, None, Console(quiet=True))
+    env_params = compiled_world.make_env_params(0)
+    _, state = compiled_world.env.reset(jax.random.key(0), env_params)
+    observation = compiled_world.env.observe(state, env_params)
     action, memory = jax.jit(policy.act)(observation, policy.init(), heading=0, moved=False)
     assert 0 <= int(action) < compiled_world.env.num_actions
     np.testing.assert_array_equal(memory.policy_state.use_experience, 1.0)

@@ -1,7 +1,8 @@
-"""Validation: what is measured, logged and exported."""
+"""Validation during training: its measurements, its log rows and the exported policies."""
 
 import dataclasses
 import io
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,32 +23,30 @@ QUIET = PlainConsole(quiet=True)
 
 
 @pytest.fixture(scope="module")
-def validated(drawn_run):
-    """The validator of a run, and its policies as training holds them."""
+def validator_setup(drawn_run):
+    """Settings of a run, its policies, its validator, and parameters by arm and seed as training holds them."""
     config = dataclasses.replace(drawn_run.config, val_episodes=12)
     policies = drawn_run.policies()
-    training = compile_training_world(config, QUIET)
-    validator = Validator(config, policies.make_agent_loop(training), policies.knowledge, training, QUIET)
-    held = {
-        arm: [
-            jaxnav.load_policy(drawn_run.config.run_dir / "policies" / f"{arm}-{seed}").params
-            for seed in range(policies.num_seeds)
-        ]
-        for arm in policies.arms
-    }
-    return config, policies, validator, held
+    training_world = compile_training_world(config, QUIET)
+    validator = Validator(config, policies.make_agent_loop(training_world), policies.knowledge, training_world, QUIET)
+    params_by_arm = {arm: [] for arm in policies.arms}
+    for arm in policies.arms:
+        for seed in range(policies.num_seeds):
+            policy = jaxnav.load_policy(drawn_run.config.run_dir / "policies" / f"{arm}-{seed}")
+            params_by_arm[arm].append(policy.params)
+    return config, policies, validator, params_by_arm
 
 
 @pytest.mark.slow
-def test_validator_equals_evaluation_on_the_same_episodes(validated):
-    config, policies, validator, held = validated
+def test_validator_equals_evaluation_on_equal_episodes(validator_setup):
+    config, policies, validator, params_by_arm = validator_setup
     rows = [EvaluationRow(arm, None, None, decoding) for arm in policies.arms for decoding in DECODINGS]
     compiled_world = compile_evaluation_world(config, "val", None, None, QUIET)
     _, outcome, _ = evaluate_rows(rows, policies, compiled_world, config.val_episodes, 2**32)
-    scores = validator.measure(held)
+    scores = validator.measure(params_by_arm)
     for row, success, done in zip(rows, np.asarray(outcome.success), np.asarray(outcome.done), strict=True):
         if row.decoding == "sample":
-            continue  # the draws are others
+            continue  # the evaluation draws other actions
         for seed, score in enumerate(scores[row.variant]):
             assert score["val_success"] == success[seed].mean()
             assert score["val_timeout"] == pytest.approx(1 - done[seed].mean())
@@ -56,77 +55,87 @@ def test_validator_equals_evaluation_on_the_same_episodes(validated):
 
 
 @pytest.mark.slow
-def test_success_by_budget_grows_to_the_validation_success(validated):
-    _, policies, validator, held = validated
-    reach = validator.success_by_budget(held)
-    scores = validator.measure(held)
+def test_success_by_budget_grows_to_the_validation_success(validator_setup):
+    _, policies, validator, params_by_arm = validator_setup
+    reach = validator.success_by_budget(params_by_arm)
+    scores = validator.measure(params_by_arm)
     assert reach["budgets"] == sorted(set(reach["budgets"]))
     for arm in policies.arms:
         for split in ("val", "train"):
             curve = reach[split][arm]["argmax"]
             assert curve == sorted(curve)
+
+        # The largest budget is the step limit.
         success = np.mean([score["val_success"] for score in scores[arm]])
         assert reach["val"][arm]["argmax"][-1] == pytest.approx(success, abs=1e-4)
 
 
 @pytest.mark.parametrize(
-    ("validations", "after"), [(0, []), (1, [12]), (2, [6, 12]), (5, [4, 6, 8, 10, 12]), (99, [2, 4, 6, 8, 10, 12])]
+    ("validations", "expected_updates"),
+    [(0, []), (1, [12]), (2, [6, 12]), (5, [4, 6, 8, 10, 12]), (99, [2, 4, 6, 8, 10, 12])],
 )
-def test_validation_updates_are_evenly_spaced_and_end_with_the_last_chunk(validations, after):
+def test_validation_updates_are_evenly_spaced_and_end_with_the_last_chunk(validations, expected_updates):
     ppo = PPOConfig(num_envs=64, rollout=10, minibatches=4)
     config = RunConfig(chunk=2, total_steps=12 * 640, ppo=ppo, validations=validations)
-    assert sorted(config.validation_updates) == after
+    assert sorted(config.validation_updates) == expected_updates
 
 
 @pytest.mark.exhaustive
 def test_train_exports_the_policy_with_the_highest_validation_success(config, tmp_path):
     config = dataclasses.replace(config, run_dir=tmp_path / "run", total_steps=8 * config.total_steps, val_episodes=40)
     run = train(dataclasses.replace(config, validations=4))
-    last = train(dataclasses.replace(config, validations=0, run_dir=tmp_path / "last"))
+    unvalidated_run = train(dataclasses.replace(config, validations=0, run_dir=tmp_path / "unvalidated"))
     rows = [row for row in run.log() if "val_success" in row]
     assert len({row["step"] for row in rows}) == 4
-    differ = []
+
     for arm in config.arms:
         for seed in range(config.seeds):
-            course = [row["val_success"] for row in rows if (row["arm"], row["seed"]) == (arm, seed)]
-            best = len(course) - 1 - int(np.argmax(course[::-1]))
-            exported, final = (
-                jaxnav.load_policy(one_run.config.run_dir / "policies" / f"{arm}-{seed}").params
-                for one_run in (run, last)
-            )
-            same = np.array_equal(exported["fuse"]["kernel"], final["fuse"]["kernel"])
-            assert same == (best == len(course) - 1)  # measuring changes nothing of training
-            differ.append(not same)
+            # The last of several best validations counts.
+            success = [row["val_success"] for row in rows if (row["arm"], row["seed"]) == (arm, seed)]
+            best_index = len(success) - 1 - int(np.argmax(success[::-1]))
+
+            # Validation changes nothing of training, so a run without it exports the policy of the last update.
+            policy_path = Path("policies") / f"{arm}-{seed}"
+            exported_params = jaxnav.load_policy(run.config.run_dir / policy_path).params
+            last_params = jaxnav.load_policy(unvalidated_run.config.run_dir / policy_path).params
+            is_last = np.array_equal(exported_params["fuse"]["kernel"], last_params["fuse"]["kernel"])
+            assert is_last == (best_index == len(success) - 1)
+
     assert run.success_by_budget() is not None
-    assert last.success_by_budget() is None
+    assert unvalidated_run.success_by_budget() is None
 
 
 @pytest.mark.slow
-def test_validator_uses_layout_weights_in_any_order_of_the_arms(validated):
-    config, policies, validator, held = validated
-    training = compile_training_world(config, QUIET)
+def test_validator_uses_layout_weights_in_any_order_of_the_arms(validator_setup):
+    config, policies, validator, params_by_arm = validator_setup
+    training_world = compile_training_world(config, QUIET)
     reversed_config = dataclasses.replace(config, arms=("layout", "baseline"), validations=1)
-    trainer = make_trainer(reversed_config, training.env, policies.estimator_config, policies.knowledge)
-    reversed_validator = _make_validator(reversed_config, trainer, policies.knowledge, training, QUIET)
+    trainer = make_trainer(reversed_config, training_world.env, policies.estimator_config, policies.knowledge)
+    reversed_validator = _make_validator(reversed_config, trainer, policies.knowledge, training_world, QUIET)
     assert reversed_validator is not None
-    expected = validator.measure(held)
-    measured = reversed_validator.measure({arm: held[arm] for arm in reversed_config.arms})
+
+    # Scores of best actions are equal, because they depend on no draws.
+    expected = validator.measure(params_by_arm)
+    scores = reversed_validator.measure({arm: params_by_arm[arm] for arm in reversed_config.arms})
     for seed in range(policies.num_seeds):
-        for name in ("val_success", "val_timeout", "val_wrong_done"):  # of best actions, so no draws enter
-            assert measured["layout"][seed][name] == expected["layout"][seed][name]
-    # The weights matter: without them the same policies end other episodes.
-    plain = trainer.learners["baseline"].agent_loop
-    unweighted = Validator(config, plain, policies.knowledge, training, QUIET).measure(held)
-    assert unweighted["layout"] != expected["layout"]
+        for name in ("val_success", "val_timeout", "val_wrong_done"):
+            assert scores["layout"][seed][name] == expected["layout"][seed][name]
+
+    # Without layout weights, these policies have other scores.
+    baseline_loop = trainer.learners["baseline"].agent_loop
+    unweighted_validator = Validator(config, baseline_loop, policies.knowledge, training_world, QUIET)
+    unweighted_scores = unweighted_validator.measure(params_by_arm)
+    assert unweighted_scores["layout"] != expected["layout"]
 
 
 @pytest.mark.exhaustive
 def test_train_without_val_scenes_exports_the_last_policy(config, tmp_path):
-    scenes = tmp_path / "train_only.jsonl"
-    write_scenes(scenes, [make_generated_scenes("rooms", "train", 2)[i] for i in range(2)])
+    scene_file = tmp_path / "train_only.jsonl"
+    train_scenes = make_generated_scenes("rooms", "train", 2)
+    write_scenes(scene_file, [train_scenes[index] for index in range(2)])
     output = io.StringIO()
     console = PlainConsole(file=output, width=400)
-    run = train(dataclasses.replace(config, run_dir=tmp_path / "run", scenes=scenes, validations=1), console)
+    run = train(dataclasses.replace(config, run_dir=tmp_path / "run", scenes=scene_file, validations=1), console)
     assert "no val scenes, so the policies of the last update are exported" in output.getvalue()
     assert run.success_by_budget() is None
     assert not any("val_success" in row for row in run.log())
