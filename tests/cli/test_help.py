@@ -131,7 +131,7 @@ def test_train_help_shows_the_values_of_a_config(tmp_path, capsys):
         assert f"(default: {value})" in text
 
 
-def test_help_leaves_the_settings_of_a_run_as_they_are(tmp_path):
+def test_help_leaves_the_settings_of_a_run_as_they_are():
     # A run with the defaults filled in would count as a run of another world, with other files.
     assert fill_world_defaults(RunConfig()) != RunConfig()
     assert RunConfig().worlds.num_train is None
@@ -160,7 +160,7 @@ def test_help_on_a_terminal_without_unicode_is_readable():
 
 
 @pytest.mark.slow
-def test_scripts_of_the_repository_have_the_help_of_their_command(capsys, monkeypatch):
+def test_scripts_of_the_repository_have_the_help_of_their_command():
     root = Path(__file__).parents[2]
     for script in ("train", "eval"):
         command = [sys.executable, str(root / f"{script}.py"), "--help"]

@@ -48,7 +48,7 @@ def test_scenes_show_writes_a_png_of_the_figure_size(scene_file, tmp_path, capsy
 
 
 @pytest.mark.slow
-def test_scenes_show_selects_by_name_number_or_the_first(scene_file, tmp_path, monkeypatch, capsys):
+def test_scenes_show_selects_by_name_number_or_the_first(scene_file, tmp_path, monkeypatch):
     # The only picture is named after the scene, and lies in the working directory.
     monkeypatch.chdir(tmp_path)
     pictures = {}

@@ -71,7 +71,7 @@ PRIORS = dataclasses.replace(METHODS["sp"], learn=functools.partial(graph_from_f
 
 
 @pytest.mark.exhaustive
-def test_custom_edges_must_match_the_categories_of_the_world(tmp_path, monkeypatch, capsys):
+def test_custom_edges_must_match_the_categories_of_the_world(tmp_path, monkeypatch):
     (tmp_path / "my_priors.py").write_text(PRIORS_MODULE)
     (tmp_path / "edges.csv").write_text("Mug,DiningTable")
     monkeypatch.syspath_prepend(tmp_path)
