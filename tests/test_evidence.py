@@ -1,4 +1,4 @@
-"""The gap that measures how badly what was seen fits the prior: by hand, against SciPy, and telling layouts apart."""
+"""Tests of the evidence gap, a measure of how badly views fit the prior: worked arithmetic, SciPy, shifted layouts."""
 
 import hypothesis.extra.numpy as hnp
 import hypothesis.strategies as st
@@ -12,7 +12,9 @@ from scipy.stats import dirichlet, dirichlet_multinomial, mannwhitneyu, multinom
 from jaxnav.gaps import evidence_gap
 from jaxnav.layout import ESTIMATORS, EstimatorConfig, LayoutEstimator, prior_from_counts
 
-NUM_CATEGORIES, NUM_EPISODES, NUM_STEPS = 12, 200, 20
+NUM_CATEGORIES = 12
+NUM_EPISODES = 200
+NUM_STEPS = 20
 VIEWS = hnp.arrays(np.bool_, (5, NUM_CATEGORIES))
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -20,7 +22,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 @jax.jit
 @jax.vmap
 def jitted_gaps(prior, views):
-    """The gaps [T] along one episode, views bool [T, K]."""
+    """Gaps [T] along one episode of views bool [T, K]."""
     estimator = LayoutEstimator(prior, "evidence")
 
     def step(state, view):
@@ -31,21 +33,20 @@ def jitted_gaps(prior, views):
 
 
 def gaps_of(prior, views) -> np.ndarray:
-    """[E, T] of views [E, T, K], all from one prior."""
+    """Gaps [E, T] of views [E, T, K], where all episodes begin with one prior."""
     return np.asarray(jitted_gaps(jnp.broadcast_to(prior, (len(views), *prior.shape)), jnp.asarray(views)))
 
 
 def random_prior(seed: int) -> jax.Array:
-    """Uneven rows; a third of the pairs was never seen."""
+    """Prior with uneven rows, in which a third of the pairs has no count."""
     generator = np.random.default_rng(seed)
-    counts = generator.integers(1, 300, (NUM_CATEGORIES, NUM_CATEGORIES)) * (
-        generator.random((NUM_CATEGORIES, NUM_CATEGORIES)) < 2 / 3
-    )
-    return prior_from_counts(jnp.asarray(counts), "evidence")
+    counts = generator.integers(1, 300, (NUM_CATEGORIES, NUM_CATEGORIES))
+    has_count = generator.random((NUM_CATEGORIES, NUM_CATEGORIES)) < 2 / 3
+    return prior_from_counts(jnp.asarray(counts * has_count), "evidence")
 
 
 def zoned_views(generator: np.random.Generator) -> np.ndarray:
-    """Views bool [EPISODES, STEPS, K] of three categories, as a rule of one of three zones of four."""
+    """Views bool [E, T, K] of three categories each, mostly of one of three zones of four categories."""
     views = np.zeros((NUM_EPISODES, NUM_STEPS, NUM_CATEGORIES), bool)
     for view in views.reshape(-1, NUM_CATEGORIES):
         zone = generator.integers(3)
@@ -55,7 +56,7 @@ def zoned_views(generator: np.random.Generator) -> np.ndarray:
 
 
 def zoned_prior() -> jax.Array:
-    """What such views show together, counted in other episodes."""
+    """Prior from the pairs of categories in the zoned views of other episodes."""
     views = zoned_views(np.random.default_rng(9)).reshape(-1, NUM_CATEGORIES).astype(int)
     return prior_from_counts(jnp.asarray(views.T @ views), "evidence")
 
@@ -66,17 +67,20 @@ def area_under_curve(low_values: np.ndarray, high_values: np.ndarray) -> float:
 
 @pytest.mark.slow
 def test_evidence_gap_follows_worked_arithmetic():
-    """0 is seen with 2. Row 0: p = (-, 3/4, 1/4), a = 4, so p . p = 0.625; then q = (-, 3/5, 2/5) and p . q = 0.55.
+    """A view shows 0 with 2. Row 0: p = (-, 3/4, 1/4), a = 4, p . p = 0.625; then q = (-, 3/5, 2/5) and p . q = 0.55.
 
-    v = 3/4 * 1/4 * (3/4 - 1/4)^2 = 0.046875, its standard deviation sqrt(v * 1 / (5 * 5)) = 0.0433, and row 2 is its
-    mirror image: z = 2 * 0.075 / (2 * 0.0433) = sqrt(3), D = 2 Phi(1.7321) - 1 = 0.9167. Had 0 been seen with 1, then
-    q = (-, 4/5, 1/5), p . q = 0.65 > p . p, and in row 1, which is uniform, all agree alike: D = 0.
+    With v = 3/4 * 1/4 * (3/4 - 1/4)^2 = 0.046875 the standard deviation is sqrt(v * 1 / (5 * 5)) = 0.0433. Row 2 is the
+    mirror image of row 0, so z = 2 * 0.075 / (2 * 0.0433) = sqrt(3) and D = 2 Phi(1.7321) - 1 = 0.9167.
+
+    A view that shows 0 with 1 gives q = (-, 4/5, 1/5) and p . q = 0.65 > p . p; row 1 is uniform, so every count agrees
+    with it equally: D = 0.
     """
     prior = jnp.array([[0.0, 3, 1], [2, 0, 2], [1, 3, 0]])
     estimator = LayoutEstimator(prior, "evidence")
-    unlikely, likely = (estimator.update(estimator.init(), jnp.array(view)).gap for view in ([1, 0, 1], [1, 1, 0]))
-    np.testing.assert_allclose(unlikely, 0.9167, atol=1e-4)
-    assert float(likely) == 0
+    unlikely_state = estimator.update(estimator.init(), jnp.array([1, 0, 1]))
+    likely_state = estimator.update(estimator.init(), jnp.array([1, 1, 0]))
+    np.testing.assert_allclose(unlikely_state.gap, 0.9167, atol=1e-4)
+    assert float(likely_state.gap) == 0
 
 
 @given(SEEDS, VIEWS)
@@ -87,6 +91,9 @@ def test_evidence_gap_agrees_with_scipy(seed, views):
     state = estimator.init()
     for view in views:
         state = estimator.update(state, jnp.asarray(view))
+
+    # Per row: by how much the posterior falls short of the expected agreement p . p, and the deviation of this excess
+    # under the prior, by the covariance of the sightings. The rows count as fully correlated, so both just add up.
     excess = deviation = 0.0
     for row in range(NUM_CATEGORIES):
         prior_row, posterior_row = (
@@ -96,8 +103,10 @@ def test_evidence_gap_agrees_with_scipy(seed, views):
         prior_shares = prior_row / prior_row.sum()
         excess += prior_shares @ prior_shares - prior_shares @ (prior_row + num_seen) / (prior_row + num_seen).sum()
         if num_seen.sum():
-            covariance = dirichlet_multinomial(prior_row, int(num_seen.sum())).cov()  # of the sightings
+            covariance = dirichlet_multinomial(prior_row, int(num_seen.sum())).cov()
             deviation += np.sqrt(prior_shares @ covariance @ prior_shares) / (prior_row + num_seen).sum()
+
+    # D = 2 Phi(z) - 1 at z = excess / deviation, and 0 if the views fit better than expected.
     expected = max(2 * norm.cdf(excess / deviation) - 1, 0) if deviation else 0
     np.testing.assert_allclose(state.gap, expected, atol=1e-4)
 
@@ -124,13 +133,15 @@ def test_evidence_gap_of_a_uniform_prior_is_zero():
 
 
 def test_misfits_raise_the_evidence_gap_and_fitting_views_lower_it():
-    misfits = np.zeros((6, NUM_CATEGORIES), bool)
-    misfits[::2, [0, 4]] = True  # of two zones
-    misfits[1::2, [1, 5]] = True
-    fitting = np.zeros((12, NUM_CATEGORIES), bool)
-    fitting[::2, [0, 1]] = True
-    fitting[1::2, [4, 5]] = True
-    (gaps,) = gaps_of(zoned_prior(), np.concatenate([misfits, fitting])[None])
+    # Six views of two categories of different zones, then twelve views of two categories of one zone.
+    misfit_views = np.zeros((6, NUM_CATEGORIES), bool)
+    misfit_views[::2, [0, 4]] = True
+    misfit_views[1::2, [1, 5]] = True
+    fitting_views = np.zeros((12, NUM_CATEGORIES), bool)
+    fitting_views[::2, [0, 1]] = True
+    fitting_views[1::2, [4, 5]] = True
+
+    (gaps,) = gaps_of(zoned_prior(), np.concatenate([misfit_views, fitting_views])[None])
     assert (np.diff(gaps[1:6]) > 0).all()
     assert gaps[5] > 0.9
     assert (np.diff(gaps[7:]) <= 0).all()
@@ -139,17 +150,23 @@ def test_misfits_raise_the_evidence_gap_and_fitting_views_lower_it():
 
 @pytest.mark.slow
 def test_closed_gate_keeps_the_evidence_gap():
-    """No decay: with nothing new the evidence is what it was. Belief and accepted view are those of `calibrated`."""
+    """The evidence gap does not decay: views without news leave the evidence unchanged.
+
+    Belief and accepted view equal those of `calibrated`.
+    """
+    # One view three times, then a single category.
     views = np.zeros((4, NUM_CATEGORIES), bool)
-    views[:3, [0, 4]] = True  # repeated, then a single category
+    views[:3, [0, 4]] = True
     views[3, 7] = True
     (gaps,) = gaps_of(zoned_prior(), views[None])
     assert gaps[0] > 0.3
     np.testing.assert_array_equal(gaps, gaps[0])
-    estimators = [LayoutEstimator(zoned_prior(), name) for name in ("evidence", "calibrated")]
-    evidence_state, calibrated_state = (
-        estimator.update(estimator.init(), jnp.asarray(views[0])) for estimator in estimators
-    )
+
+    # The estimators `evidence` and `calibrated` differ only in the gap.
+    evidence_estimator = LayoutEstimator(zoned_prior(), "evidence")
+    calibrated_estimator = LayoutEstimator(zoned_prior(), "calibrated")
+    evidence_state = evidence_estimator.update(evidence_estimator.init(), jnp.asarray(views[0]))
+    calibrated_state = calibrated_estimator.update(calibrated_estimator.init(), jnp.asarray(views[0]))
     np.testing.assert_array_equal(evidence_state.alpha, calibrated_state.alpha)
     np.testing.assert_array_equal(evidence_state.last_visible, calibrated_state.last_visible)
     assert evidence_state.gap != calibrated_state.gap
@@ -159,18 +176,23 @@ def test_closed_gate_keeps_the_evidence_gap():
 @pytest.mark.slow
 @pytest.mark.parametrize("independent", [False, True])
 def test_evidence_gap_exceeds_its_level_in_the_expected_share_of_layouts(independent):
-    """Layouts drawn from the prior: D = 2 P - 1 with P uniform where one row is seen, nearer 1/2 where all are.
+    """Layouts drawn from the prior give D = 2 P - 1, with P uniform for views of one row and nearer 1/2 for all rows.
 
-    So D > 0 in half of the layouts, and D > 0.5 in a quarter, or in far fewer: the rows are taken as fully correlated.
+    So D > 0 in half of the layouts. D > 0.5 in a quarter of them for one row, and in far fewer for all rows, since the
+    gap takes the rows as fully correlated.
     """
-    generator, prior = np.random.default_rng(0), np.asarray(zoned_prior(), np.float64)
+    generator = np.random.default_rng(0)
+    prior = np.asarray(zoned_prior(), np.float64)
+
+    # In each of 1,000 episodes, 30 sightings per row of a layout that is drawn from the prior.
     row_indices = range(NUM_CATEGORIES) if independent else range(1)
     alpha = np.tile(prior, (1000, 1, 1))
     for row in row_indices:
-        others = np.arange(NUM_CATEGORIES) != row
-        layouts = dirichlet.rvs(prior[row, others], size=len(alpha), random_state=generator)
+        is_companion = np.arange(NUM_CATEGORIES) != row
+        layouts = dirichlet.rvs(prior[row, is_companion], size=len(alpha), random_state=generator)
         for episode_alpha, layout in zip(alpha, layouts, strict=True):
-            episode_alpha[row, others] += multinomial.rvs(30, layout, random_state=generator)
+            episode_alpha[row, is_companion] += multinomial.rvs(30, layout, random_state=generator)
+
     gaps = np.asarray(jax.vmap(evidence_gap, (None, 0))(jnp.float32(prior), jnp.float32(alpha)))
     assert abs((gaps > 0).mean() - 0.5) < 0.05
     if independent:
@@ -181,15 +203,24 @@ def test_evidence_gap_exceeds_its_level_in_the_expected_share_of_layouts(indepen
 
 @pytest.mark.slow
 def test_evidence_gap_tells_layouts_apart():
-    """Views drawn from the prior keep it low, the same with categories renamed at random raise it, and by evidence."""
-    generator, prior = np.random.default_rng(0), zoned_prior()
-    same_views, control_views, other_views = (zoned_views(generator) for _ in range(3))
-    other_views = np.stack([episode[:, generator.permutation(NUM_CATEGORIES)] for episode in other_views])
-    gaps, control_gaps, shifted_gaps = (gaps_of(prior, views) for views in (same_views, control_views, other_views))
+    """Views drawn from the prior keep the gap low, and views of randomly renamed categories raise it step by step."""
+    # Two sets of episodes with the layout of the prior, and one whose categories are renamed in every episode.
+    generator = np.random.default_rng(0)
+    training_views = zoned_views(generator)
+    control_views = zoned_views(generator)
+    original_views = zoned_views(generator)
+    shifted_views = np.stack([episode[:, generator.permutation(NUM_CATEGORIES)] for episode in original_views])
+
+    prior = zoned_prior()
+    gaps = gaps_of(prior, training_views)
+    control_gaps = gaps_of(prior, control_views)
+    shifted_gaps = gaps_of(prior, shifted_views)
     assert gaps[:, -1].mean() < 0.25
     assert shifted_gaps[:, -1].mean() > 0.75
+
+    # The gap separates the layouts better with every step; it does not separate two sets of one layout.
     area_by_step = [area_under_curve(gaps[:, time_index], shifted_gaps[:, time_index]) for time_index in (0, 4, 19)]
     assert area_by_step[0] < area_by_step[1] < area_by_step[2]
     assert area_by_step[1] > 0.8
     assert area_by_step[2] > 0.95
-    assert abs(area_under_curve(gaps[:, -1], control_gaps[:, -1]) - 0.5) < 0.1  # negative control
+    assert abs(area_under_curve(gaps[:, -1], control_gaps[:, -1]) - 0.5) < 0.1

@@ -1,7 +1,8 @@
-"""Equations 3 to 6: the belief, its expectation, the gap, and the named settings."""
+"""Tests of equations 3 to 6: the layout belief, its expectation, the layout gap and the named estimators."""
 
 import dataclasses
 
+import chex
 import hypothesis.extra.numpy as hnp
 import jax
 import jax.numpy as jnp
@@ -26,8 +27,8 @@ NUM_CATEGORIES = 6
 PRESENCE = hnp.arrays(np.bool_, (4, NUM_CATEGORIES))
 
 
-def make_state(alpha, last=(0,) * NUM_CATEGORIES, gap=0.0) -> LayoutState:
-    return LayoutState(jnp.asarray(alpha, jnp.float32), jnp.array(last, bool), jnp.float32(gap))
+def make_state(alpha, last_visible=(0,) * NUM_CATEGORIES, gap=0.0) -> LayoutState:
+    return LayoutState(jnp.asarray(alpha, jnp.float32), jnp.array(last_visible, bool), jnp.float32(gap))
 
 
 def random_counts(seed: int = 0, size: int = NUM_CATEGORIES) -> jax.Array:
@@ -36,20 +37,22 @@ def random_counts(seed: int = 0, size: int = NUM_CATEGORIES) -> jax.Array:
 
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_prior_rows_have_their_strength_and_a_lower_bound(name):
-    counts, setting = random_counts(), ESTIMATORS[name]
+    counts = random_counts()
     alpha = np.asarray(prior_from_counts(counts, name))
+
+    # No category is its own companion, and every pair has some weight.
     is_off_diagonal = ~np.eye(NUM_CATEGORIES, dtype=bool)
     assert (np.diag(alpha) == 0).all()
     assert (alpha[is_off_diagonal] >= 0.01).all()
+
+    # Without a strength the prior is the counts, else 20 ((1 - 0.05) n_ij / n_i + 0.05 / (K - 1)).
     pair_counts = np.where(is_off_diagonal, counts, 0)
-    if setting.strength is None:
+    if ESTIMATORS[name].strength is None:
         np.testing.assert_array_equal(alpha, pair_counts)
     else:
-        # 20 ((1 - 0.05) n_ij / n_i + 0.05 / (K - 1))
         row_shares = pair_counts / pair_counts.sum(-1, keepdims=True)
-        np.testing.assert_allclose(
-            alpha[is_off_diagonal], (20 * (0.95 * row_shares + 0.05 / (NUM_CATEGORIES - 1)))[is_off_diagonal], rtol=1e-5
-        )
+        expected_alpha = 20 * (0.95 * row_shares + 0.05 / (NUM_CATEGORIES - 1))
+        np.testing.assert_allclose(alpha[is_off_diagonal], expected_alpha[is_off_diagonal], rtol=1e-5)
         np.testing.assert_allclose(alpha.sum(-1), 20, rtol=1e-5)
 
 
@@ -62,7 +65,7 @@ def test_prior_rows_of_unseen_categories_are_uniform():
 
 @pytest.mark.slow
 def test_calibrated_update_follows_worked_arithmetic():
-    """S = 20, uniform prior, K = 22, V = 3: every entry is 20 / 21, each visible row gains two counts of one.
+    """S = 20, uniform prior, K = 22, V = 3: every entry is 20 / 21, and each visible row gains two counts of 1.
 
     KL = 2 g(20/21, 1) - g(20, 2) with g(a, 1) = psi(a + 1) - log a and g(20, 2) = 2 psi(22) - log 20 - log 21
        = 2 * (0.3913 + 0.0488) - (2 * 3.0681 - 2.9957 - 3.0445) = 0.7842, so D = tanh(0.7842) = 0.6552.
@@ -70,18 +73,23 @@ def test_calibrated_update_follows_worked_arithmetic():
     estimator = LayoutEstimator(prior_from_counts(jnp.ones((22, 22))))
     presence = jnp.zeros(22, bool).at[jnp.array([1, 4, 9])].set(True)
     state = estimator.update(estimator.init(), presence)
+
+    # The gap is the tanh of the divergence, which the docstring works out to four digits.
     alpha = 20 / 21
     divergence = 2 * (digamma(alpha + 1) - np.log(alpha)) - (2 * digamma(22) - np.log(20) - np.log(21))
     assert abs(divergence - 0.7842) < 1e-3
     np.testing.assert_allclose(state.gap, np.tanh(divergence), rtol=1e-4)
-    # Only the visible rows and columns gained, and not on the diagonal.
+
+    # Only the visible rows and columns gain counts, except on the diagonal.
     alpha_gain = np.asarray(state.alpha - estimator.prior)
     visible = np.asarray(presence, np.float32)
     np.testing.assert_allclose(alpha_gain, np.outer(visible, visible) - np.diag(visible), atol=1e-6)
 
 
 def run_views(estimator: LayoutEstimator, views) -> list[LayoutState]:
-    jitted_update, states = jax.jit(type(estimator).update), [estimator.init()]
+    """State of the estimator after each view."""
+    jitted_update = jax.jit(type(estimator).update)
+    states = [estimator.init()]
     for view in views:
         states.append(jitted_update(estimator, states[-1], jnp.asarray(view)))
     return states[1:]
@@ -89,33 +97,44 @@ def run_views(estimator: LayoutEstimator, views) -> list[LayoutState]:
 
 def test_gap_falls_as_evidence_gathers():
     """Views drawn from the prior, S = 20, V = 3: the mean gap is large at first and below 0.5 by step 20."""
-    estimator, rng = LayoutEstimator(prior_from_counts(jnp.ones((22, 22)))), np.random.default_rng(0)
-    home = rng.permutation(22)[:6]
+    estimator = LayoutEstimator(prior_from_counts(jnp.ones((22, 22))))
+
+    # A home has six categories, and each view shows three of them.
+    rng = np.random.default_rng(0)
+    home_categories = rng.permutation(22)[:6]
     views = np.zeros((20, 22), bool)
     for view in views:
-        view[rng.choice(home, 3, replace=False)] = True
+        view[rng.choice(home_categories, 3, replace=False)] = True
+
     gaps = [float(state.gap) for state in run_views(estimator, views)]
     assert gaps[0] > 0.6
     assert max(gaps[-5:]) < 0.5
     assert gaps[-1] < gaps[0] / 2
 
 
-def views_of(*sets) -> np.ndarray:
-    return np.array([[i in visible for i in range(NUM_CATEGORIES)] for visible in sets])
+def views_of(*category_sets) -> np.ndarray:
+    """Views bool [T, K], each of which shows one set of categories."""
+    views = np.zeros((len(category_sets), NUM_CATEGORIES), bool)
+    for view, visible_categories in zip(views, category_sets, strict=True):
+        view[list(visible_categories)] = True
+    return views
 
 
 @pytest.mark.slow
 def test_disabling_the_gap_does_not_change_the_belief():
+    # Two estimators differ only in their gap.
     counts = jnp.arange(16.0).reshape(4, 4) + 1.0
-    setting = ESTIMATORS["calibrated"]
-    prior = prior_from_counts(counts, setting)
-    plain_estimator = LayoutEstimator(prior, setting)
-    gapless_estimator = LayoutEstimator(prior, dataclasses.replace(setting, gap="none"))
+    config = ESTIMATORS["calibrated"]
+    prior = prior_from_counts(counts, config)
+    plain_estimator = LayoutEstimator(prior, config)
+    gapless_estimator = LayoutEstimator(prior, dataclasses.replace(config, gap="none"))
+
+    # Their beliefs stay bit-identical from view to view.
     plain_state = plain_estimator.init()
     gapless_state = gapless_estimator.init()
-    for visible in ([1, 1, 0, 0], [1, 0, 0, 0], [1, 1, 0, 1]):
-        plain_state = plain_estimator.update(plain_state, jnp.array(visible))
-        gapless_state = gapless_estimator.update(gapless_state, jnp.array(visible))
+    for view in ([1, 1, 0, 0], [1, 0, 0, 0], [1, 1, 0, 1]):
+        plain_state = plain_estimator.update(plain_state, jnp.array(view))
+        gapless_state = gapless_estimator.update(gapless_state, jnp.array(view))
         np.testing.assert_array_equal(plain_state.alpha, gapless_state.alpha)
         np.testing.assert_array_equal(plain_state.last_visible, gapless_state.last_visible)
         assert plain_state.gap > 0.0
@@ -123,11 +142,13 @@ def test_disabling_the_gap_does_not_change_the_belief():
 
 
 def test_released_gap_saturates_and_decays():
-    """Saturated KL: 0.8 when a new view of two or more comes, then 0.64 of the last value while nothing is new."""
+    """The divergence saturates: a new view of two or more categories gives 0.8, and each other step 0.64 of the last.
+
+    The view {3} is refused because it shows a single category; the {0, 1, 2} after it equals the last accepted view.
+    """
     views = views_of({2}, {0, 1}, {0, 1}, {0, 1}, {0, 1, 2}, {3}, {0, 1, 2}, {0, 2})
     estimator = LayoutEstimator(prior_from_counts(jnp.ones((NUM_CATEGORIES, NUM_CATEGORIES)), "released"), "released")
     gaps = [float(state.gap) for state in run_views(estimator, views)]
-    # {3} is refused for it is one category; the {0, 1, 2} after it equals the last accepted set.
     np.testing.assert_allclose(gaps, [0, 0.8, 0.512, 0.32768, 0.8, 0.512, 0.32768, 0.8], rtol=1e-3)
 
 
@@ -135,26 +156,40 @@ def test_released_counts_its_own_column_in_every_row():
     prior = np.asarray(prior_from_counts(random_counts(), "released"))
     estimator = LayoutEstimator(jnp.asarray(prior), "released")
     (state,) = run_views(estimator, views_of({1, 4}))
-    visible = views_of({1, 4})[0]
-    np.testing.assert_allclose(state.alpha, prior + 5 * visible[None, :])
-    expected = (
-        np.tanh(exact_kl(prior + np.eye(NUM_CATEGORIES), 5 * np.ones((NUM_CATEGORIES, 1), int) * visible).sum()) * 0.8
-    )
-    np.testing.assert_allclose(state.gap, expected, rtol=1e-4)
+
+    # Every row gains 5 in the visible columns, on the diagonal too.
+    view = views_of({1, 4})[0]
+    np.testing.assert_allclose(state.alpha, prior + 5 * view[None, :])
+
+    # The gap is the sum of the divergences of all rows, decayed once.
+    counts = 5 * np.ones((NUM_CATEGORIES, 1), int) * view
+    row_divergences = exact_kl(prior + np.eye(NUM_CATEGORIES), counts)
+    np.testing.assert_allclose(state.gap, np.tanh(row_divergences.sum()) * 0.8, rtol=1e-4)
+
+    # The expectation adds 1 on the diagonal, which already has a share of its row.
     row_shares = np.asarray(state.alpha) / np.asarray(state.alpha).sum(-1, keepdims=True)
     np.testing.assert_allclose(estimator.expectation(state), row_shares + np.eye(NUM_CATEGORIES), rtol=1e-6)
 
 
+def off_diagonal_divergences(alpha, counts) -> np.ndarray:
+    """Exact divergence of each row [K] by counts int [K, K], without the entries of the diagonal."""
+    row_divergences = []
+    for row in range(NUM_CATEGORIES):
+        row_divergences.append(exact_kl(np.delete(alpha[row], row), np.delete(counts[row], row)))
+    return np.array(row_divergences)
+
+
 def test_paper_setting_follows_equation_5():
-    """All rows, mean over K, no gate: also a single visible category and a repeated view count."""
+    """All rows, mean over K, no gate: a view of a single category and a repeated view count as well."""
     views = np.array([[0, 1, 0, 0, 0, 0], [0, 3, 0, 0, 1, 0], [0, 3, 0, 0, 1, 0], [0] * 6, [12, 0, 1, 0, 0, 2]])
     prior = np.asarray(prior_from_counts(random_counts(3), "paper"))
     states = run_views(LayoutEstimator(jnp.asarray(prior), "paper"), views)
     alpha = prior
     for view, state in zip(views, states, strict=True):
-        counts = np.where(np.eye(NUM_CATEGORIES, dtype=bool), 0, view[None, :])  # n_{-i}
-        row_divergences = [exact_kl(np.delete(alpha[i], i), np.delete(counts[i], i)) for i in range(NUM_CATEGORIES)]
-        np.testing.assert_allclose(state.gap, np.tanh(np.mean(row_divergences)), rtol=1e-3, atol=1e-7)
+        # Row i counts the view without category i: n_{-i}.
+        counts = np.where(np.eye(NUM_CATEGORIES, dtype=bool), 0, view[None, :])
+        row_divergences = off_diagonal_divergences(alpha, counts)
+        np.testing.assert_allclose(state.gap, np.tanh(row_divergences.mean()), rtol=1e-3, atol=1e-7)
         alpha = alpha + counts
         np.testing.assert_allclose(state.alpha, alpha)
 
@@ -172,42 +207,47 @@ def test_only_estimators_of_instances_read_more_than_presence(name):
 
 @pytest.mark.parametrize("name", ["released", "calibrated"])
 def test_instance_counts_of_one_equal_presence(name):
-    """Every kind of rows, reduction, increment and own column; the divergences are computed in two ways."""
+    """Both estimators together use every kind of rows, reduction, increment and own column.
+
+    Instance counts and presence compute the divergences in two different ways.
+    """
     prior = prior_from_counts(random_counts(8), name)
     views = np.random.default_rng(2).random((12, NUM_CATEGORIES)) < 0.4
     counting_config = dataclasses.replace(ESTIMATORS[name], counts="instances")
     counting_states = run_views(LayoutEstimator(prior, counting_config), views)
-    for state, presence_state in zip(counting_states, run_views(LayoutEstimator(prior, name), views), strict=True):
+    presence_states = run_views(LayoutEstimator(prior, name), views)
+    for state, presence_state in zip(counting_states, presence_states, strict=True):
         np.testing.assert_array_equal(state.alpha, presence_state.alpha)
         np.testing.assert_allclose(state.gap, presence_state.gap, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize(("rows", "reduction"), [("all", "mean_visible"), ("visible", "sum"), ("visible", "mean")])
 def test_rows_and_reduction_select_the_divergences(rows, reduction):
-    prior, view = np.asarray(prior_from_counts(random_counts(5), EstimatorConfig())), views_of({0, 2, 3})[0]
+    prior = np.asarray(prior_from_counts(random_counts(5), EstimatorConfig()))
+    (view,) = views_of({0, 2, 3})
+
+    # Counts of the rows that learn, and the exact divergence of each row.
     updated_rows = view if rows == "visible" else np.ones(NUM_CATEGORIES, bool)
     counts = np.outer(updated_rows, view) & ~np.eye(NUM_CATEGORIES, dtype=bool)
-    row_divergences = np.array(
-        [exact_kl(np.delete(prior[i], i), np.delete(counts[i], i).astype(int)) for i in range(NUM_CATEGORIES)]
-    )
+    row_divergences = off_diagonal_divergences(prior, counts.astype(int))
     expected = {
         "mean_visible": row_divergences[view].mean(),
         "sum": row_divergences.sum(),
         "mean": row_divergences.mean(),
     }[reduction]
+
     (state,) = run_views(LayoutEstimator(jnp.asarray(prior), EstimatorConfig(rows=rows, reduction=reduction)), [view])
     np.testing.assert_allclose(state.gap, np.tanh(expected), rtol=1e-4)
 
 
 def test_mean_visible_of_a_single_category_is_its_own_divergence():
-    """It counts itself, so its row learns something alone."""
-    setting = EstimatorConfig(reduction="mean_visible", own_column=True, gate=False)
-    prior = np.asarray(prior_from_counts(random_counts(6), setting))
+    """With its own column, the row of a category learns from a view that shows only this category."""
+    config = EstimatorConfig(reduction="mean_visible", own_column=True, gate=False)
+    prior = np.asarray(prior_from_counts(random_counts(6), config))
     (view,) = views_of({1})
-    (state,) = run_views(LayoutEstimator(jnp.asarray(prior), setting), [view])
-    np.testing.assert_allclose(
-        state.gap, np.tanh(exact_kl(prior[1] + np.eye(NUM_CATEGORIES)[1], view.astype(int))), rtol=1e-4
-    )
+    (state,) = run_views(LayoutEstimator(jnp.asarray(prior), config), [view])
+    divergence = exact_kl(prior[1] + np.eye(NUM_CATEGORIES)[1], view.astype(int))
+    np.testing.assert_allclose(state.gap, np.tanh(divergence), rtol=1e-4)
 
 
 @pytest.mark.slow
@@ -215,12 +255,18 @@ def test_closed_gate_keeps_the_belief_and_decays_the_gap():
     alpha = prior_from_counts(random_counts())
     state = make_state(alpha, views_of({0, 1})[0], 0.5)
     estimator = LayoutEstimator(alpha)
-    for visible in ((), {3}, {0, 1}):
-        next_state = estimator.update(state, jnp.asarray(views_of(visible)[0]))
+
+    # Nothing, a single category and a repeated view leave the gate closed: the gap decays from 0.5 to 0.4.
+    for view in views_of((), {3}, {0, 1}):
+        next_state = estimator.update(state, jnp.asarray(view))
         np.testing.assert_array_equal(next_state.alpha, alpha)
         np.testing.assert_array_equal(next_state.last_visible, state.last_visible)
         np.testing.assert_allclose(next_state.gap, 0.4)
-    assert float(estimator.update(state, jnp.asarray(views_of({0, 2})[0])).alpha.sum()) > float(alpha.sum()) + 1
+
+    # Negative control: a new view opens the gate.
+    (new_view,) = views_of({0, 2})
+    next_state = estimator.update(state, jnp.asarray(new_view))
+    assert float(next_state.alpha.sum()) > float(alpha.sum()) + 1
 
 
 @pytest.mark.slow
@@ -243,9 +289,15 @@ def test_expectation_is_normalized_and_paper_belief_ignores_order(name, views):
 def test_goal_weights_are_the_column_not_the_row():
     """Negative control: with an asymmetric prior the row w[goal, :] is another vector."""
     estimator = LayoutEstimator(prior_from_counts(random_counts()))
-    expectation, goal_weights = estimator.expectation(estimator.init()), estimator.goal_weights(estimator.init(), 2)
+    expectation = estimator.expectation(estimator.init())
+    goal_weights = estimator.goal_weights(estimator.init(), 2)
     assert np.abs(goal_weights - expectation[2]).max() > 0.05
     assert float(goal_weights[2]) == 1
+
+
+def take_episode(states: LayoutState, episode: int) -> LayoutState:
+    """State of one episode of a batch."""
+    return jax.tree.map(lambda leaf: leaf[episode], states)
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
@@ -260,37 +312,34 @@ def test_vmapped_update_equals_single_updates_and_traces_once(name):
         traces.append(1)
         return LayoutEstimator(prior, name).update(state, view)
 
+    # Three episodes of five views at once; presence may also be given as floats.
     states = jax.vmap(lambda prior: LayoutEstimator(prior, name).init())(priors)
     for time_index in range(5):
-        states = step(priors, states, views[:, time_index].astype(jnp.float32))  # real presence is accepted too
+        states = step(priors, states, views[:, time_index].astype(jnp.float32))
     assert len(traces) == 1
+
+    # Every episode ends in the state of an estimator that runs this episode only.
     for episode in range(3):
         single_state = run_views(LayoutEstimator(priors[episode], name), np.asarray(views[episode]))[-1]
-        jax.tree.map(
-            lambda batch_leaf, single_leaf, episode=episode: np.testing.assert_allclose(
-                batch_leaf[episode], single_leaf, rtol=1e-5, atol=1e-6
-            ),
-            states,
-            single_state,
-        )
+        chex.assert_trees_all_close(take_episode(states, episode), single_state, rtol=1e-5, atol=1e-6)
 
 
 def test_named_estimators_have_the_documented_settings():
-    common = {"strength": None, "uniform": 0.0, "rows": "all"}
-    paper = {"reduction": "mean", "increment": 1, "own_column": False, "gate": False, "form": "paper"}
-    paper |= {"counts": "instances"}
-    released = {"reduction": "sum", "increment": 5, "own_column": True, "gate": True, "form": "residual"}
-    calibrated = {"rows": "visible", "reduction": "mean_visible", "increment": 1, "own_column": False, "gate": True}
-    calibrated |= {"decay": 0.8, "passes": 1, "strength": 20.0, "uniform": 0.05, "form": "residual"}
-    calibrated |= {"counts": "presence"}
-    expected = {
-        "paper": common | paper | {"gap": "novelty"},
-        "released": common | released | {"gap": "novelty", "decay": 0.8, "passes": 2},
-        "calibrated": calibrated | {"gap": "novelty"},
-        "evidence": calibrated | {"gap": "evidence"},
+    common_fields = {"strength": None, "uniform": 0.0, "rows": "all"}
+    paper_fields = {"reduction": "mean", "increment": 1, "own_column": False, "gate": False, "form": "paper"}
+    paper_fields |= {"counts": "instances"}
+    released_fields = {"reduction": "sum", "increment": 5, "own_column": True, "gate": True, "form": "residual"}
+    calibrated_fields = {"rows": "visible", "reduction": "mean_visible", "increment": 1, "own_column": False}
+    calibrated_fields |= {"gate": True, "decay": 0.8, "passes": 1, "strength": 20.0, "uniform": 0.05}
+    calibrated_fields |= {"form": "residual", "counts": "presence"}
+    expected_fields = {
+        "paper": common_fields | paper_fields | {"gap": "novelty"},
+        "released": common_fields | released_fields | {"gap": "novelty", "decay": 0.8, "passes": 2},
+        "calibrated": calibrated_fields | {"gap": "novelty"},
+        "evidence": calibrated_fields | {"gap": "evidence"},
     }
-    assert expected.keys() == ESTIMATORS.keys()
-    for name, fields in expected.items():
+    assert expected_fields.keys() == ESTIMATORS.keys()
+    for name, fields in expected_fields.items():
         assert fields.items() <= dataclasses.asdict(ESTIMATORS[name]).items()
 
 
@@ -318,7 +367,7 @@ def test_prior_needs_two_categories():
     np.testing.assert_allclose(prior_from_counts(jnp.ones((2, 2))), [[0, 20], [20, 0]], rtol=1e-6)
 
 
-def test_unknown_estimator_names_the_nearest():
+def test_unknown_estimator_is_refused_with_the_nearest_name():
     with pytest.raises(ValueError, match="calibrated"):
         LayoutEstimator(jnp.ones((NUM_CATEGORIES, NUM_CATEGORIES)), "calibratd")
 
@@ -333,8 +382,11 @@ def test_relative_weights_follow_worked_arithmetic():
     np.testing.assert_allclose(relative_weights, [[1 / 3, 1.0, 2 / 3, 2.0]] * 2, rtol=1e-6)
 
 
-def test_relative_weights_are_bounded_off_the_goal_and_leave_the_goal_alone():
-    """One companion of eight has all weight: 7 times the mean; the released code's goal weight, above 1, stays."""
+def test_relative_weights_are_bounded_off_the_goal_and_keep_the_goal_weight():
+    """One companion of eight has all the weight, 7 times the mean, and reaches the bound.
+
+    The weight of the goal stays, even if it is above 1 as in the released code.
+    """
     raw_weights = jnp.array([1.3, 0.7, *[0.0] * 6])
     relative_weights = scale_weights(raw_weights, jnp.int32(0))
     np.testing.assert_allclose(relative_weights, [1.3, MAX_RELATIVE_WEIGHT, *[0.0] * 6], rtol=1e-6)

@@ -1,4 +1,4 @@
-"""First contact: the package's names, the commands, the README's example, and the shortest method of the docs."""
+"""Tests of the public names, the command line, the README's example and the shortest method of the documentation."""
 
 import ast
 import dataclasses
@@ -26,7 +26,7 @@ from jaxnav.policies.pathways import PolicyInputs
 from jaxnav.scenes.task import NUM_ACTIONS
 
 ROOT = Path(__file__).parent.parent
-INIT = (ROOT / "jaxnav" / "__init__.py").read_text()
+PACKAGE_SOURCE = (ROOT / "jaxnav" / "__init__.py").read_text()
 README = (ROOT / "README.md").read_text()
 README_EXAMPLE, *_ = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 METHOD_SECTION = (ROOT / "docs" / "add_a_method.md").read_text().partition("\n## ")[0]
@@ -42,21 +42,24 @@ def test_package_shows_only_its_public_names():
 
 
 def test_type_checkers_see_the_public_names():
-    (type_block,) = (node for node in ast.parse(INIT).body if isinstance(node, ast.If))
+    # The only `if` of the module is the block of imports for type checkers.
+    (type_block,) = (node for node in ast.parse(PACKAGE_SOURCE).body if isinstance(node, ast.If))
     typed_names = {}
     for node in type_block.body:
         assert isinstance(node, ast.ImportFrom)
         assert node.module is not None
         module = importlib.import_module(node.module)
         typed_names |= {alias.name: getattr(module, alias.name) for alias in node.names}
+
+    # These imports give every public name, and each name has the value that the package gives at run time.
     assert typed_names.keys() | {"__version__"} == set(jaxnav.__all__)
     for name, value in typed_names.items():
         assert getattr(jaxnav, name) is value
 
 
 def test_importing_jaxnav_loads_no_heavy_package():
-    heavy = ("orbax", "tyro", "matplotlib", "PIL", "optax", "flax.nnx", "jaxnav.cli", "jaxnav.training")
-    script = f"import sys, jaxnav; print([name for name in {heavy} if name in sys.modules])"
+    heavy_packages = ("orbax", "tyro", "matplotlib", "PIL", "optax", "flax.nnx", "jaxnav.cli", "jaxnav.training")
+    script = f"import sys, jaxnav; print([name for name in {heavy_packages} if name in sys.modules])"
     assert subprocess.check_output([sys.executable, "-c", script], cwd=ROOT, text=True) == "[]\n"
 
 
@@ -88,9 +91,9 @@ def test_main_passes_arguments_to_commands(tmp_path, capsys):
 
 
 def test_readme_example_runs(capsys):
-    names = {}
-    exec(README_EXAMPLE, names)
-    assert names["weights"].shape == (8, 22)
+    namespace = {}
+    exec(README_EXAMPLE, namespace)
+    assert namespace["weights"].shape == (8, 22)
     assert capsys.readouterr().out
 
 
@@ -99,7 +102,7 @@ def test_readme_example_runs(capsys):
 
 @pytest.fixture
 def method_folder(tmp_path):
-    """A folder with the page's module, and nothing else."""
+    """A folder that holds only the module of the page."""
     (tmp_path / "module").mkdir()
     (tmp_path / "module" / "shortest.py").write_text(SHORTEST_METHOD)
     return tmp_path / "module"
@@ -108,39 +111,50 @@ def method_folder(tmp_path):
 @pytest.mark.slow
 def test_shortest_method_passes_ruff_and_pyright(method_folder):
     assert SHORTEST_METHOD.count("\n") <= 25
-    method_file, pyright_config = method_folder / "shortest.py", method_folder / "pyrightconfig.json"
+    # Checks of the linter, the formatter and the type checker.
+    method_file = method_folder / "shortest.py"
+    pyright_config = method_folder / "pyrightconfig.json"
     pyright_config.write_text(json.dumps({"include": ["."], "extraPaths": [str(ROOT)], "typeCheckingMode": "standard"}))
-    checks = [
+    commands = [
         ["ruff", "check", "--no-cache", "--config", ROOT / "pyproject.toml", method_file],
         ["ruff", "format", "--no-cache", "--check", "--config", ROOT / "pyproject.toml", method_file],
         ["pyright", "-p", pyright_config, "--pythonpath", sys.executable],
     ]
 
-    def is_clean(check):
-        return subprocess.run([sys.executable, "-m", *check], cwd=ROOT, capture_output=True).returncode == 0
+    def is_clean(command):
+        return subprocess.run([sys.executable, "-m", *command], cwd=ROOT, capture_output=True).returncode == 0
 
-    assert [is_clean(check) for check in checks] == [True] * 3
-    method_file.write_text(
-        SHORTEST_METHOD.replace("SHORTEST = Method(Detections)", "SHORTEST = Method( 'Detections', undefined)")
+    assert [is_clean(command) for command in commands] == [True] * 3
+
+    # Negative control: an undefined name of the wrong type after a stray space fails every check.
+    faulty_method = SHORTEST_METHOD.replace(
+        "SHORTEST = Method(Detections)", "SHORTEST = Method( 'Detections', undefined)"
     )
-    assert [is_clean(check) for check in checks] == [False] * 3
+    method_file.write_text(faulty_method)
+    assert [is_clean(command) for command in commands] == [False] * 3
 
 
 @pytest.mark.slow
 def test_shortest_method_makes_experience(method_folder, monkeypatch):
+    # An untrained policy of the method, and the first four views of the kitchen.
     monkeypatch.syspath_prepend(method_folder)
     spec = dataclasses.replace(tiny.SPEC, method=find_method("shortest:SHORTEST"), method_sizes=())
     params = jax.jit(init_params, static_argnums=0)(spec, jax.random.key(0))
     observation = Observation(row=jnp.asarray(tiny.BANK.rows[:4]), goal=jnp.zeros(4, jnp.int32))
-    pathways = jax.jit(lambda params, weights: bind(spec, params).pathways(PolicyInputs(observation, weights)))
-    weights = jnp.ones((4, len(tiny.CATEGORIES)))
-    experience = pathways(params, weights).experience
-    other_experience = pathways(params, 2 * weights).experience
+
+    @jax.jit
+    def compute_pathways(params, layout_weights):
+        return bind(spec, params).pathways(PolicyInputs(observation, layout_weights))
+
+    # The experience depends on the layout weights.
+    layout_weights = jnp.ones((4, len(tiny.CATEGORIES)))
+    experience = compute_pathways(params, layout_weights).experience
+    other_experience = compute_pathways(params, 2 * layout_weights).experience
     assert experience.shape == (4, bind(spec, params).method.width)
-    assert (experience != other_experience).any()  # it hosts the layout
+    assert (experience != other_experience).any()
 
 
-ACT = """
+ACT_SCRIPT = """
 import jax, jaxnav
 policy = jaxnav.load_policy("runs/shortest/policies/layout-0")
 env, params = jaxnav.make("rooms", "val")
@@ -153,31 +167,36 @@ print(policy.act(observation, policy.init(), heading=0, moved=False)[0])
 def test_commands_of_the_page_train_and_evaluate_the_method(method_folder, tmp_path):
     run_dir = tmp_path / "run"
 
-    def run(*arguments, cwd=method_folder):
-        arguments = [str(argument).replace("runs/shortest", str(run_dir)) for argument in arguments]
+    def run_command(command, cwd=method_folder):
+        """Run a command as a user does, without a PYTHONPATH, with a run directory of this test."""
+        arguments = [str(argument).replace("runs/shortest", str(run_dir)) for argument in command]
         environment = os.environ | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "0"}
         environment.pop("PYTHONPATH", None)
         return subprocess.run(arguments, cwd=cwd, env=environment, capture_output=True, text=True)
 
-    installed = Path(sys.executable).with_name("jaxnav")
-    train_command, evaluate_command = (
-        [installed, *line.split()] for line in re.findall(r"^    jaxnav (.*?)(?: +#.*)?$", METHOD_SECTION, re.MULTILINE)
-    )
+    # The page shows one command that trains and one that evaluates.
+    jaxnav_program = Path(sys.executable).with_name("jaxnav")
+    train_line, evaluate_line = re.findall(r"^    jaxnav (.*?)(?: +#.*)?$", METHOD_SECTION, re.MULTILINE)
+    train_command = [jaxnav_program, *train_line.split()]
+    evaluate_command = [jaxnav_program, *evaluate_line.split()]
+
+    # Train with a tiny configuration, evaluate four episodes, and let a stored policy act in its environment.
     small_options = ["--config", write_config(tmp_path), "--method-sizes", "--seeds", 1, "--total-steps", 256]
     outputs = []
     for command in (
         [*train_command, *small_options],
         [*evaluate_command, "--episodes", 4],
-        [sys.executable, "-c", ACT],
+        [sys.executable, "-c", ACT_SCRIPT],
     ):
-        completed = run(*command)
+        completed = run_command(command)
         assert completed.returncode == 0, completed.stderr
         outputs.append(completed.stdout)
     assert int(outputs[-1]) in range(NUM_ACTIONS)
     rows = json.loads((run_dir / "eval-val-episodes4.json").read_text())["rows"]
     assert {row["variant"] for row in rows} == {"baseline", "layout", "tde", "stde", "random", "oracle"}
 
-    completed = run(*evaluate_command, cwd=ROOT)  # where the module is not
+    # Outside the folder of the module, the command ends with one line that names the missing module.
+    completed = run_command(evaluate_command, cwd=ROOT)
     assert completed.returncode == 2
     assert completed.stderr.count("\n") == 1
     assert "shortest:SHORTEST" in completed.stderr

@@ -1,4 +1,4 @@
-"""The files around the code: lock, Makefile, README and citation."""
+"""Tests of the files around the code: the lock file, Makefile, README, citation and changelog."""
 
 import re
 import subprocess
@@ -11,47 +11,53 @@ from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
-DEV = PROJECT["dependency-groups"]["dev"]
-# An absolute path of somebody's machine, not a part of an address or of a relative path.
+DEV_REQUIREMENTS = PROJECT["dependency-groups"]["dev"]
+#: Pattern of an absolute path of one machine, but not of a part of an address or of a relative path.
 MACHINE_PATH = re.compile(r"(?<![\w.<])/(?:work|root|home|Users|tmp/venv)/")
 
 
 def read_locked_versions() -> dict[str, str]:
-    """Return the pinned versions by name, as the lock spells it."""
+    """Pinned version by package name, as the lock file spells the name."""
     return dict(re.findall(r"^([a-z0-9-]+)==(\S+)", (ROOT / "requirements.lock").read_text(), re.MULTILINE))
 
 
 def list_repository_files() -> list[Path]:
-    """Return every file that git tracks or would add."""
+    """Every file that git tracks or would add."""
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     try:
         listing = subprocess.run(command, cwd=ROOT, capture_output=True, check=True, text=True).stdout
     except (OSError, subprocess.CalledProcessError):
         pytest.skip("not a git checkout")
-    return [path for name in listing.split("\0") if name and (path := ROOT / name).is_file()]
+
+    # A tracked file may be deleted; names are separated, and the last one ended, by NUL.
+    paths = [ROOT / name for name in listing.split("\0") if name]
+    return [path for path in paths if path.is_file()]
 
 
-@pytest.mark.parametrize("line", PROJECT["project"]["dependencies"] + DEV)
+@pytest.mark.parametrize("line", PROJECT["project"]["dependencies"] + DEV_REQUIREMENTS)
 def test_lock_pins_a_version_within_the_requirement(line: str) -> None:
     requirement = Requirement(line)
     assert read_locked_versions()[requirement.name] in requirement.specifier
 
 
 def test_dev_group_contains_every_extra() -> None:
-    """All but the client of a service, which brings a dozen packages; a job of its own installs that."""
-    extras = {name: lines for name, lines in PROJECT["project"]["optional-dependencies"].items() if name != "wandb"}
-    assert {line for lines in extras.values() for line in lines} <= set(DEV)
+    """The `wandb` extra is exempt: the client brings a dozen packages, so a separate job installs it."""
+    extra_requirements = set()
+    for extra_name, requirements in PROJECT["project"]["optional-dependencies"].items():
+        if extra_name != "wandb":
+            extra_requirements.update(requirements)
+    assert extra_requirements <= set(DEV_REQUIREMENTS)
 
 
 def test_lock_contains_only_pinned_packages() -> None:
-    # Nothing but `name==version`, markers and hashes: no index, no URL, no local file.
+    # Lines hold only `name==version`, markers and hashes: no index, no URL, no local file.
     for line in (ROOT / "requirements.lock").read_text().splitlines():
         assert re.fullmatch(r"[a-z0-9-]+==\S+( ; [^\\]+)? \\| +--hash=sha256:[0-9a-f]{64}( \\)?", line), line
 
 
 def test_readme_commands_are_make_targets() -> None:
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
-    # At the start of a line (a code block) or of a code span: prose such as "to make sure" does not count.
+    # Commands stand at the start of a line (in a code block) or of a code span; "to make sure" is prose, no command.
     pattern = r"(?:^(?: {4})?|`)(?:\$ )?make ([a-z-]+)"
     commands = set(re.findall(pattern, (ROOT / "README.md").read_text(), re.MULTILINE))
     assert {"run", "test"} <= commands <= targets
@@ -72,7 +78,7 @@ def test_changelog_begins_with_the_version() -> None:
     ("text", "matches"),
     [("see /root/notes", True), ("'/home/ann/x'", True), ("https://site.org/home/x", False), ("runs/work/x", False)],
 )
-def test_machine_path_pattern(text: str, matches: bool) -> None:
+def test_machine_path_pattern_matches_only_absolute_paths(text: str, matches: bool) -> None:
     assert bool(MACHINE_PATH.search(text)) is matches
 
 

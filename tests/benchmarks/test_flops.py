@@ -1,4 +1,4 @@
-"""The count of floating-point operations that the benchmarks divide by."""
+"""Tests of the count of floating-point operations in matrix products, from which the benchmarks compute utilisation."""
 
 import importlib.util
 from pathlib import Path
@@ -9,7 +9,9 @@ import jax.numpy as jnp
 import pytest
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
-NUM_ROWS, WIDTH, NUM_STEPS = 5, 7, 11
+NUM_ROWS = 5
+WIDTH = 7
+NUM_STEPS = 11
 
 
 @pytest.fixture(scope="module")
@@ -23,13 +25,14 @@ def flops() -> ModuleType:
 
 
 def recurrent_loss(weights, inputs, state):
-    """Return the loss of a linear recurrence: two products a step."""
+    """Loss of a linear recurrence with two products a step."""
 
-    def step(state, entering):
-        state = jnp.tanh(entering @ weights + state @ weights)
+    def step(state, step_input):
+        state = jnp.tanh(step_input @ weights + state @ weights)
         return state, None
 
-    return jax.lax.scan(step, state, inputs)[0].sum()
+    last_state, _ = jax.lax.scan(step, state, inputs)
+    return last_state.sum()
 
 
 ARGUMENTS = (jnp.ones((WIDTH, WIDTH)), jnp.ones((NUM_STEPS, NUM_ROWS, WIDTH)), jnp.ones((NUM_ROWS, WIDTH)))
@@ -42,7 +45,8 @@ def test_scan_counts_once_per_iteration(flops):
 
 
 def test_gradient_counts_forward_and_backward(flops):
-    # Back: by the weights twice and by the state once per step; nobody asks for the gradient by the inputs.
+    # Backward, each step has three products: two for the gradient by the weights and one for the gradient by the state.
+    # The gradient by the inputs is not needed.
     jaxpr = jax.make_jaxpr(jax.jit(jax.grad(recurrent_loss)))(*ARGUMENTS).jaxpr
     assert flops.matmul_flops(jaxpr) == (2 + 3) * NUM_STEPS * PRODUCT_FLOPS
 
@@ -54,9 +58,10 @@ def test_batched_products_count_once_per_entry(flops):
 
 
 def test_unused_products_do_not_count(flops):
+    # Only the gradient by the weights is returned, so the products of the gradient by the inputs are unused.
     @jax.jit
-    def gradients(weights, inputs, state):
+    def compute_gradients(weights, inputs, state):
         return jax.grad(recurrent_loss, argnums=(0, 1))(weights, inputs, state)
 
-    jaxpr = jax.make_jaxpr(lambda *arguments: gradients(*arguments)[0])(*ARGUMENTS).jaxpr
+    jaxpr = jax.make_jaxpr(lambda *arguments: compute_gradients(*arguments)[0])(*ARGUMENTS).jaxpr
     assert flops.matmul_flops(jaxpr) == (2 + 3) * NUM_STEPS * PRODUCT_FLOPS

@@ -1,4 +1,4 @@
-"""The tables of the performance pages are those of the stored results."""
+"""Tests that the tables of the performance pages show the stored results."""
 
 import importlib.util
 from pathlib import Path
@@ -33,7 +33,8 @@ def test_pages_show_the_stored_results(table, name):
 
 def test_a_changed_table_is_noticed(table):
     page = table.DOCUMENTS[0].read_text()
-    assert table.fill_page(page.replace("jaxnav, baseline", "jaxnav, base")) == page
+    changed_page = page.replace("jaxnav, baseline", "jaxnav, base")
+    assert table.fill_page(changed_page) == page
 
 
 def test_marks_name_columns_and_numbers(table, tmp_path, monkeypatch):
@@ -41,6 +42,8 @@ def test_marks_name_columns_and_numbers(table, tmp_path, monkeypatch):
         '{"machine": {}, "old": {"rate": 12345678, "time_s": 0.123456}, "new": {"rate": 2000, "time_s": true}}'
     )
     monkeypatch.setattr(table, "RESULTS", tmp_path)
+
+    # A table with one renamed column, and a number in the text.
     page = "<!-- table speed: time_s=time; rate -->\n<!-- end -->\nRate <!-- value speed.old.rate -->?<!-- end -->.\n"
     assert table.fill_page(page).splitlines()[1:-2] == [
         "|  | time | rate |",

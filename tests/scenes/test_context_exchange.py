@@ -1,4 +1,4 @@
-"""The exchange of categories that misleads most: model of places, search, and what scenes become."""
+"""Tests of the most misleading exchange of categories: the model of places, the search and the shifted scenes."""
 
 import dataclasses
 import itertools
@@ -28,13 +28,14 @@ TASK = Task(
     categories=("Mug", "Book", "CoffeeMachine", "Bed", "Sofa"),
     goals=("Mug", "Book"),
 )
+MUG, BOOK, COFFEE_MACHINE, BED, SOFA = range(len(TASK.categories))
 SMALL = (0.1, 0.1, 0.1)
 LARGE = (1.0, 1.0, 1.0)
 SMALL_GOALS = ("Book", "Clock", "Vase", "Cup", "Bottle")
 
 
-def two_contexts(index: int = 0):
-    """Return a room with a mug at a coffee machine and a book at a bed, 8 m apart, and a sofa far from both."""
+def make_room(index: int = 0):
+    """A room with a mug at a coffee machine and a book at a bed, 8 m apart, and a sofa far from both."""
     offset = 0.05 * index
     scene = draw(
         ["." * 8] * 8,
@@ -47,7 +48,7 @@ def two_contexts(index: int = 0):
     return dataclasses.replace(scene, name=f"room-{index}")
 
 
-ROOMS = [two_contexts(index) for index in range(8)]
+ROOMS = [make_room(index) for index in range(8)]
 
 
 def types_at_places(scene) -> list[str]:
@@ -58,29 +59,39 @@ def types_at_places(scene) -> list[str]:
 
 
 def test_neighbours_are_objects_within_each_distance_and_in_sight():
+    # The book is 0.8 m from the mug. The bed is 0.5 m from the mug, but behind a wall. The sofa is 3.0 m from the mug
+    # and 2.2 m from the book.
     scene = draw(
         ["........", "        ", "........"],
         ("Mug", 0.5, 0.5, 0.0, *SMALL),
-        ("Book", 1.3, 0.5, 0.0, *SMALL),  # 0.8 m from the mug
-        ("Bed", 0.5, 0.5, 0.5, *SMALL),  # 0.5 m from the mug, but behind the wall
-        ("Sofa", 3.5, 0.5, 0.0, *SMALL),  # 3.0 m from the mug, 2.2 m from the book
+        ("Book", 1.3, 0.5, 0.0, *SMALL),
+        ("Bed", 0.5, 0.5, 0.5, *SMALL),
+        ("Sofa", 3.5, 0.5, 0.0, *SMALL),
         walls=[(1, column) for column in range(8)],
     )
     places = find_places([scene], TASK, np.random.default_rng(0))
-    mug, book, bed, sofa = (TASK.categories.index(name) for name in ("Mug", "Book", "Bed", "Sofa"))
+
+    # The places of the objects come first; the places after them are cells without an object.
+    assert places.category[:4].tolist() == [MUG, BOOK, BED, SOFA]
+    assert (places.category[4:] == len(TASK.categories)).all()
+
+    # No object is a neighbour of its own place.
     assert NEIGHBOUR_DISTANCES == (1.0, 2.0, 4.0)
-    expected = np.zeros((3, 5))
-    expected[:, book] = [1, 1, 1]
-    expected[:, sofa] = [0, 0, 1]
-    np.testing.assert_array_equal(places.neighbours[0], expected)  # an object is not next to itself
-    assert places.neighbours[1, :, mug].tolist() == [1, 1, 1]
-    assert not places.neighbours[2].any()  # the bed has the wall between it and all others
-    assert places.category[:4].tolist() == [mug, book, bed, sofa]
-    assert (places.category[4:] == len(TASK.categories)).all()  # cells hold nothing
+    mug_neighbours = np.zeros((3, 5))
+    mug_neighbours[:, BOOK] = [1, 1, 1]
+    mug_neighbours[:, SOFA] = [0, 0, 1]
+    np.testing.assert_array_equal(places.neighbours[0], mug_neighbours)
+    assert places.neighbours[1, :, MUG].tolist() == [1, 1, 1]
+
+    # The wall stands between the bed and all other objects.
+    assert not places.neighbours[2].any()
 
 
 def test_place_weights_of_a_balanced_table_have_the_sign_of_the_log_odds():
-    """One distance tells: category 0 always has neighbour 1, category 1 never, and nothing in half of the places."""
+    """Only the first distance is informative.
+
+    Category 0 always has neighbour 1, category 1 never has it, and half of the places without an object have it.
+    """
     neighbours = np.zeros((40, len(NEIGHBOUR_DISTANCES), 2))
     category = np.repeat([0, 1, 2, 2], 10)
     neighbours[category == 0, 0, 1] = 1.0
@@ -88,6 +99,7 @@ def test_place_weights_of_a_balanced_table_have_the_sign_of_the_log_odds():
     weights = fit_place_weights(Places(category, neighbours, np.ones(2)))
     assert weights[0, 0, 1] > 1.0
     assert weights[1, 0, 1] < -1.0
+
     # Features that are always 0 have no weight.
     np.testing.assert_allclose(weights[:, 1:], 0.0, atol=1e-6)
     np.testing.assert_allclose(weights[:, 0, 0], 0.0, atol=1e-6)
@@ -98,21 +110,22 @@ def test_place_weights_of_a_balanced_table_have_the_sign_of_the_log_odds():
 
 def test_two_contexts_exchange_their_goals():
     exchange = fit_context_exchange(ROOMS, TASK)
-    scene = ROOMS[0]
-    shifted = exchange_places(scene, TASK, 1.0, 0, exchange)
-    new_types = types_at_places(shifted)
-    # The mug's old neighbour no longer stands next to the mug, whichever of the equivalent exchanges was found.
-    at_mug = new_types.index("Mug")
-    neighbour_of = {0: 1, 1: 0, 2: 3, 3: 2}
-    assert new_types[neighbour_of[at_mug]] != "CoffeeMachine"
-    at_book = new_types.index("Book")
-    assert new_types[neighbour_of[at_book]] != "Bed"
+    new_types = types_at_places(exchange_places(ROOMS[0], TASK, 1.0, 0, exchange))
+
+    # Several exchanges are equivalent; in each of them, mug and book lose their old neighbours.
+    neighbour_place = {0: 1, 1: 0, 2: 3, 3: 2}
+    mug_place = new_types.index("Mug")
+    assert new_types[neighbour_place[mug_place]] != "CoffeeMachine"
+    book_place = new_types.index("Book")
+    assert new_types[neighbour_place[book_place]] != "Bed"
+
     # Goals stay among goals.
     assert {new_types[0], new_types[2]} == {"Mug", "Book"}
 
 
 def test_search_finds_the_best_of_all_permutations():
-    """Compared with every permutation within the classes: 3! of the goals times 4! of the other categories."""
+    """All permutations within the groups are compared: 3! of the goals times 4! of the remaining categories."""
+    # Random places of three small goals and four large categories; 7 is the category of a place without an object.
     rng = np.random.default_rng(3)
     is_goal = np.arange(7) < 3
     num_places = 400
@@ -121,47 +134,52 @@ def test_search_finds_the_best_of_all_permutations():
     places = Places(category, neighbours, np.where(is_goal, 1.5, 5.0))
 
     weights = fit_place_weights(places)
-    mean_neighbours = np.stack([neighbours[category == k].mean(axis=0) for k in range(7)])
+    mean_neighbours = np.stack([neighbours[category == index].mean(axis=0) for index in range(7)])
 
     def score(place_of) -> float:
+        """Score of a permutation: objects of category k stand where those of `place_of[k]` stood."""
         total = 0.0
         for goal in range(3):
             for distance, neighbour in itertools.product(range(3), range(7)):
-                chance = mean_neighbours[place_of[goal], distance, place_of[neighbour]]
-                total += weights[goal, distance, neighbour] * chance
+                neighbour_rate = mean_neighbours[place_of[goal], distance, place_of[neighbour]]
+                total += weights[goal, distance, neighbour] * neighbour_rate
         return total
 
+    # The found permutation has the lowest score.
+    goal_orders = itertools.permutations(range(3))
+    remaining_orders = itertools.permutations(range(3, 7))
     all_scores = []
-    for goals, others in itertools.product(itertools.permutations(range(3)), itertools.permutations(range(3, 7))):
-        all_scores.append(score([*goals, *others]))
+    for goal_order, remaining_order in itertools.product(goal_orders, remaining_orders):
+        all_scores.append(score([*goal_order, *remaining_order]))
     cycles = find_misleading_cycles(places, is_goal, np.random.default_rng(0))
     assert score(apply_cycles(cycles, 7)) == pytest.approx(min(all_scores), abs=1e-9)
-    # Cycles come with the most misleading first.
-    alone = [score(apply_cycles([cycle], 7)) for cycle in cycles]
-    assert alone == sorted(alone)
+
+    # The most misleading cycle comes first.
+    cycle_scores = [score(apply_cycles([cycle], 7)) for cycle in cycles]
+    assert cycle_scores == sorted(cycle_scores)
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_cycles_are_those_of_the_permutation(seed):
+def test_applied_cycles_of_a_permutation_give_the_permutation(seed):
     permutation = np.random.default_rng(seed).permutation(9)
     np.testing.assert_array_equal(apply_cycles(list_cycles(permutation), 9), permutation)
 
 
 @pytest.mark.slow
 def test_random_exchanges_reach_every_permutation_within_the_groups():
-    # Two small goals and three large categories: 2! x 3! = 12 permutations. After 250 draws, one is missing with a
-    # chance below 12 x (11 / 12)^250 < 1e-8.
-    goals = {TASK.categories.index(name) for name in ("Mug", "Book")}
-    drawn = set()
+    # Two small goals and three large categories: 2! x 3! = 12 permutations. After 250 draws, some permutation is
+    # missing with a probability below 12 x (11 / 12)^250 < 1e-8.
+    goals = {MUG, BOOK}
+    drawn_permutations = set()
     for seed in range(250):
         (cycles,) = draw_exchange(ROOMS, TASK, seed).values()
-        drawn.add(cycles)
+        drawn_permutations.add(cycles)
         for cycle in cycles:
             assert set(cycle) <= goals or goals.isdisjoint(cycle)
-    assert len(drawn) == 12
+    assert len(drawn_permutations) == 12
 
 
-def test_rooms_in_which_nothing_can_exchange_have_no_cycles():
+def test_rooms_without_exchangeable_categories_have_no_cycles():
     room = draw(["." * 4] * 4, ("Mug", 9.0, 0.5, 9.0, *SMALL), ("Bed", 9.7, 0.5, 9.0, *LARGE))
     assert fit_context_exchange([room], TASK) == {room.room_type: ()}
     with pytest.raises(InputError, match="no exchange of categories misleads"):
@@ -171,19 +189,19 @@ def test_rooms_in_which_nothing_can_exchange_have_no_cycles():
 # Scenes
 
 
-def test_objects_of_a_cycle_go_to_the_places_of_the_category_before():
-    mug, book = (TASK.categories.index(name) for name in ("Mug", "Book"))
-    machine, bed, sofa = (TASK.categories.index(name) for name in ("CoffeeMachine", "Bed", "Sofa"))
-    exchange = {ROOMS[0].room_type: ((mug, book), (machine, bed, sofa))}
-    shifted = exchange_places(ROOMS[0], TASK, 1.0, 0, exchange)
-    assert types_at_places(shifted) == ["Book", "Bed", "Mug", "Sofa", "CoffeeMachine"]
-    # Half of two cycles is the first, whatever the seed.
+def test_objects_of_a_cycle_go_to_the_places_of_the_previous_category():
+    exchange = {ROOMS[0].room_type: ((MUG, BOOK), (COFFEE_MACHINE, BED, SOFA))}
+    shifted_room = exchange_places(ROOMS[0], TASK, 1.0, 0, exchange)
+    assert types_at_places(shifted_room) == ["Book", "Bed", "Mug", "Sofa", "CoffeeMachine"]
+
+    # Half of two cycles is the first cycle, for any seed.
     for seed in range(5):
-        half_shifted = exchange_places(ROOMS[0], TASK, 0.5, seed, exchange)
-        assert types_at_places(half_shifted) == ["Book", "CoffeeMachine", "Mug", "Bed", "Sofa"]
-    # Without a bed, the two others of its cycle exchange.
-    without_bed = draw(["." * 4] * 4, ("CoffeeMachine", 9.0, 0.5, 9.0, *LARGE), ("Sofa", 12.0, 0.5, 9.0, *LARGE))
-    assert types_at_places(exchange_places(without_bed, TASK, 1.0, 0, exchange)) == ["Sofa", "CoffeeMachine"]
+        half_shifted_room = exchange_places(ROOMS[0], TASK, 0.5, seed, exchange)
+        assert types_at_places(half_shifted_room) == ["Book", "CoffeeMachine", "Mug", "Bed", "Sofa"]
+
+    # In a room without a bed, the two remaining categories of the cycle exchange.
+    bedless_room = draw(["." * 4] * 4, ("CoffeeMachine", 9.0, 0.5, 9.0, *LARGE), ("Sofa", 12.0, 0.5, 9.0, *LARGE))
+    assert types_at_places(exchange_places(bedless_room, TASK, 1.0, 0, exchange)) == ["Sofa", "CoffeeMachine"]
 
 
 def test_rooms_of_another_type_are_refused():
@@ -193,24 +211,29 @@ def test_rooms_of_another_type_are_refused():
 
 @pytest.mark.slow
 def test_houses_shift_equally_and_nested():
-    """Every house has the same exchange, a larger shift exchanges a superset, and goals stay among goals."""
+    """All houses share one exchange, a larger shift exchanges a superset, and goals stay among goals."""
     task = dataclasses.replace(WORLDS["houses"].task, goals=SMALL_GOALS)
     exchange = fit_scene_exchange(make_generated_scenes("houses", "train", 40), task)
     scenes = make_generated_scenes("houses", "val", 12)
+
+    # Per shift and category: the categories that come to its places. Goals stay among goals.
     is_goal = task.is_goal()
-    maps = {}
+    new_categories = {}
     for shift in (0.25, 0.5, 1.0):
         shifted_scenes = shift_scenes(scenes, task, shift, 0, exchange)
         for index in range(len(scenes)):
             old_ids = category_ids(scenes[index].types, task.categories)
             new_ids = category_ids(shifted_scenes[index].types, task.categories)
-            for old, new in zip(old_ids, new_ids, strict=True):
-                assert old == new or is_goal[old] == is_goal[new]
-                maps.setdefault((shift, old), set()).add(new)
-    # A category's places get one category, or another where one of the cycle is missing from a house.
-    full_cycles = exchange["house"]
-    for shift, num_cycles in ((0.25, max(1, round(0.25 * len(full_cycles)))), (1.0, len(full_cycles))):
-        exchanged = {k for cycle in full_cycles[:num_cycles] for k in cycle}
+            for old_id, new_id in zip(old_ids, new_ids, strict=True):
+                assert old_id == new_id or is_goal[old_id] == is_goal[new_id]
+                new_categories.setdefault((shift, old_id), set()).add(new_id)
+
+    # A shift exchanges the first of the cycles, and the places of all other categories keep their category. (Within a
+    # cycle, the new category depends on the house, because a house may lack a category.)
+    cycles = exchange["house"]
+    num_quarter_cycles = max(1, round(0.25 * len(cycles)))
+    for shift, num_cycles in ((0.25, num_quarter_cycles), (1.0, len(cycles))):
+        exchanged_categories = set(itertools.chain.from_iterable(cycles[:num_cycles]))
         for category in range(len(task.categories)):
-            if category not in exchanged:
-                assert maps.get((shift, category), {category}) == {category}
+            if category not in exchanged_categories:
+                assert new_categories.get((shift, category), {category}) == {category}

@@ -1,4 +1,4 @@
-"""Animations: a GIF in memory, of an episode of a policy or of frames of any agent."""
+"""Tests of animations: a GIF in memory of an episode of a policy or of the frames of any agent."""
 
 import base64
 import io
@@ -13,7 +13,7 @@ import jaxnav
 
 
 def read_gif(data):
-    """The frames of a GIF, uint8 [T, height, width, 3], and the milliseconds of each."""
+    """Frames of a GIF, uint8 [T, height, width, 3], and the duration of each in milliseconds."""
     frames = []
     durations = []
     for frame in ImageSequence.Iterator(Image.open(io.BytesIO(data))):
@@ -27,8 +27,12 @@ def test_frames_become_a_gif():
     frames = [np.full((20, 30, 3), color, np.uint8) for color in colors]
     animation = jaxnav.animate(frames, fps=5)
     shown_frames, durations = read_gif(animation.data)
-    np.testing.assert_allclose(shown_frames.astype(int), np.array(frames, int), atol=8)  # a palette of 128 colors
-    assert durations[:-1] == [200, 200]  # milliseconds at five frames a second
+
+    # A palette of 128 colors rounds the frames.
+    np.testing.assert_allclose(shown_frames.astype(int), np.array(frames, int), atol=8)
+
+    # At five frames a second, a frame lasts 200 ms; the last one is shown for longer.
+    assert durations[:-1] == [200, 200]
     assert durations[-1] > 1000
 
 
@@ -41,11 +45,13 @@ def test_animation_is_shown_in_notebooks_and_saved(tmp_path):
 
 @pytest.mark.slow
 def test_rendered_states_of_any_agent_are_animated():
+    # Two frames: before and after a turn.
     env, params = jaxnav.make("rooms", split="val")
     _, state = env.reset(jax.random.key(0), params)
     frames = [env.render(state, params, size=64)]
     _, state, *_ = env.step(jax.random.key(1), state, jaxnav.ROTATE_LEFT, params)
     frames.append(env.render(state, params, size=64))
+
     shown_frames, _ = read_gif(jaxnav.animate(frames).data)
     assert shown_frames.shape == (2, *frames[0].shape)
 
@@ -58,7 +64,7 @@ def test_episode_of_a_policy_is_animated():
 
 
 @pytest.mark.parametrize(
-    ("frames", "named"),
+    ("frames", "problem"),
     [
         ([], "empty"),
         ([np.zeros((4, 4, 3))], "frame 0 .*float64.*uint8"),
@@ -66,8 +72,8 @@ def test_episode_of_a_policy_is_animated():
         ([np.zeros((4, 4, 3), np.uint8), np.zeros((5, 4, 3), np.uint8)], r"frame 1 .*\(5, 4, 3\)"),
     ],
 )
-def test_what_is_no_picture_is_refused(frames, named):
-    with pytest.raises(jaxnav.InputError, match=named):
+def test_frames_that_are_no_pictures_are_refused(frames, problem):
+    with pytest.raises(jaxnav.InputError, match=problem):
         jaxnav.animate(frames)
 
 

@@ -1,4 +1,4 @@
-"""The picture of a scene: its marks, the pose it is seen from, and names that do not overlap."""
+"""Tests of the picture of a scene: its marks, its default pose, and names that do not overlap."""
 
 import dataclasses
 
@@ -13,7 +13,7 @@ from jaxnav.scenes.worlds import WORLDS, make_generated_scenes
 from jaxnav.viz.scene import draw_plan, scene_figure, view_from_pose
 
 TASK = Task(detector=PERFECT_DETECTOR)
-# Cells (0, 0) to (0, 2) m and, with no way there, one at (1, 0); a wall on the right.
+# Cells from (0, 0) to (0, 2) m, an unreachable cell at (0.75, 0), and a wall on the right.
 HALL = draw(
     [".##.#"] + [".####"] * 8,
     ("Book", 0.0, 0.8, 2.5, *SMALL),
@@ -25,8 +25,8 @@ HALL = draw(
 SCALE_LABEL = "  1 m"
 
 
-def plan_of(scene, task=TASK):
-    """The axes of the plan, seen from the default pose."""
+def draw_default_plan(scene, task=TASK):
+    """Axes of the plan, with the view from the default pose."""
     return scene_figure(scene, task, view_from_pose(scene, task, None)).axes[0]
 
 
@@ -51,7 +51,7 @@ def detected_names(view):
 
 
 def test_view_from_pose_detects_objects_ahead_by_distance():
-    # From (0, 1.5) to the book is 1 m, to the bowl the root of 1 + 1/16; the chair is behind.
+    # From (0, 1.5) the distance to the book is 1 m, and to the bowl sqrt(1 + 1/16); the chair is behind.
     view = view_from_pose(HALL, TASK, (0.05, 1.45, 0.0))
     assert view.place.tolist() == [0.0, 1.5]
     detected_places = [(name, place.tolist()) for _, name, place in view.detections]
@@ -66,11 +66,13 @@ def test_view_from_pose_normalises_the_heading():
 
 
 def test_default_pose_detects_the_most_objects():
+    # All cells of the hall and all headings.
     num_detections = []
     for row in range(9):
         for heading in range(8):
             view = view_from_pose(HALL, TASK, (0.0, 0.25 * row, 45.0 * heading))
             num_detections.append(len(view.detections))
+
     default_view = view_from_pose(HALL, TASK, None)
     assert detected_names(default_view) == ["Book", "Bowl"]
     assert len(default_view.detections) == max(num_detections)
@@ -80,7 +82,9 @@ def test_default_pose_detects_the_most_objects():
 def test_scene_figure_draws_boxes_cells_and_detections():
     figure = scene_figure(HALL, TASK, view_from_pose(HALL, TASK, (0.0, 1.5, 0.0)))
     plan = figure.axes[0]
-    assert sorted_labels(plan) == [SCALE_LABEL, "Book", "Bowl", "Chair"]  # a sofa is no category here
+
+    # Only objects of the categories have names; the sofa belongs to none.
+    assert sorted_labels(plan) == [SCALE_LABEL, "Book", "Bowl", "Chair"]
 
     # Four boxes, nine standable cells, one unreachable cell, rings around both detections.
     boxes, cells, crosses, rings = plan.collections
@@ -97,7 +101,7 @@ def test_scene_figure_draws_boxes_cells_and_detections():
 
 def test_scene_figure_describes_scene_and_view():
     text = all_text(scene_figure(HALL, TASK, view_from_pose(HALL, TASK, (0.0, 1.5, 0.0))))
-    # Without the wall x goes from the chair's -0.3 (the book's side) to 0.875, z from -1.25 to 2.525.
+    # Without the wall, x goes from -0.3 (the side of the book) to 0.875 and z from -1.25 to 2.525.
     for part in (
         "drawn",
         "kitchen, train",
@@ -136,12 +140,12 @@ def test_scene_figure_tints_and_names_rooms():
     bedroom = np.zeros((9, 5), bool)
     bedroom[:, 3] = True
     home = dataclasses.replace(HALL, rooms=(Room("living_room", living_room), Room("bedroom", bedroom)))
-    plan = plan_of(home)
+    plan = draw_default_plan(home)
     assert {"living room", "bedroom"} < set(sorted_labels(plan))
 
     # Only the cells of rooms change colour, and rooms differ.
     tinted_pixels = np.asarray(plan.images[0].get_array())
-    plain_pixels = np.asarray(plan_of(HALL).images[0].get_array())
+    plain_pixels = np.asarray(draw_default_plan(HALL).images[0].get_array())
     assert (tinted_pixels != plain_pixels).any(axis=-1).tolist() == (living_room | bedroom).tolist()
     assert not np.array_equal(tinted_pixels[0, 0], tinted_pixels[0, 3])
 
@@ -160,19 +164,19 @@ def test_scene_figure_neither_overlaps_nor_clips_names(world, index):
     assert all(plan_box.containsx(box.x0) and plan_box.containsx(box.x1) for box in name_boxes)
     assert count_overlaps([box.shrunk(0.98, 0.9) for box in name_boxes]) == 0
 
-    # The description lies within the figure, beside the plan.
+    # The description lies within the figure, next to the plan.
     text_boxes = [text.get_window_extent() for text in figure.texts]
     assert all(box.x1 < figure.bbox.x1 and box.y0 > 0 for box in text_boxes)
     assert not any(box.overlaps(plan.bbox) for box in text_boxes)
 
 
 def test_scene_figure_spreads_a_crowd_of_names():
-    # Two dozen objects 0.15 m apart: the names can only be apart if they give way.
+    # Two dozen objects 0.15 m apart: their names overlap unless they are moved.
     crowd = []
     for index in range(24):
         category = TASK.categories[index % 22]
         crowd.append((category, 0.5 + 0.15 * index, 0.8, 1.0 + 1.1 * (index % 2), *SMALL))
-    plan = plan_of(draw(["." * 20] * 16, *crowd))
+    plan = draw_default_plan(draw(["." * 20] * 16, *crowd))
     name_boxes = [text.get_window_extent() for text in plan.texts]
     assert len(name_boxes) >= 23
     assert count_overlaps(name_boxes) <= 4

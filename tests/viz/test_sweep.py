@@ -1,4 +1,4 @@
-"""The figure of a sweep: curves of every shift, honest axes, bands where there are intervals."""
+"""Tests of the figure of a sweep: a curve and a band for every shift, and axes that do not exaggerate."""
 
 import numpy as np
 import pytest
@@ -18,23 +18,22 @@ def sweeps(tmp_path_factory):
 
 @pytest.mark.slow
 def test_curves_are_the_rows_in_rising_order_of_the_threshold(sweeps):
-    figure = sweep_figure(sweeps)
-    axes_of_sr = figure.axes[0]
-    rows = {row.epsilon: row for row in sweeps[1].rows()}
-    curves = [line for line in axes_of_sr.lines if line.get_marker() != "None"]
+    # Curves have markers, unlike the lines of seeds. The second curve shows the mean success of the second sweep.
+    sr_axes = sweep_figure(sweeps).axes[0]
+    curves = [line for line in sr_axes.lines if line.get_marker() != "None"]
     assert len(curves) == len(sweeps)
+    rows = {row.epsilon: row for row in sweeps[1].rows()}
+    expected_means = [rows[epsilon].metrics["sr"].mean for epsilon in (0.0, 0.5, 1.0)]
     np.testing.assert_array_equal(curves[1].get_xdata(), sorted(EPSILON))
-    np.testing.assert_array_equal(
-        curves[1].get_ydata(), [rows[epsilon].metrics["sr"].mean for epsilon in (0.0, 0.5, 1.0)]
-    )
+    np.testing.assert_array_equal(curves[1].get_ydata(), expected_means)
 
     # A thin line for every seed and a band for every shift.
-    assert len(axes_of_sr.lines) == len(sweeps) * (1 + NUM_SEEDS)
-    assert len(axes_of_sr.collections) == len(sweeps)
+    assert len(sr_axes.lines) == len(sweeps) * (1 + NUM_SEEDS)
+    assert len(sr_axes.collections) == len(sweeps)
 
 
 @pytest.mark.slow
-def test_axes_of_percent_start_at_0_and_those_of_changes_are_symmetric(sweeps):
+def test_axes_of_percent_start_at_0_and_axes_of_changes_are_symmetric(sweeps):
     sr_axes, spl_axes, sr_change_axes, spl_change_axes = sweep_figure(sweeps).axes
     for axes in (sr_axes, spl_axes):
         bottom, top = axes.get_ylim()
@@ -47,7 +46,7 @@ def test_axes_of_percent_start_at_0_and_those_of_changes_are_symmetric(sweeps):
 
 @pytest.mark.slow
 def test_title_names_method_and_episodes(sweeps):
-    (sweep, _) = sweeps
+    sweep, _ = sweeps
     title = sweep_figure(sweep).axes[0].get_title(loc="left")
     assert title == "ORG, run: 24 val episodes, best actions"
     assert sweep_figure(sweep, "Mine").axes[0].get_title(loc="left") == "Mine"

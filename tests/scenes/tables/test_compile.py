@@ -1,4 +1,4 @@
-"""Compiled scenes: detections, the ego-centric view, and banks."""
+"""Tests of compiled scenes: detections, the ego-centric view and banks."""
 
 import dataclasses
 
@@ -39,7 +39,7 @@ def test_detection_bytes_of_a_drawn_object():
 
 
 def view_picture(scene, cell, heading, rules=ROOMS):
-    """Return the ego-centric view as 11 texts of 11 characters (`.` free, `#` blocked, `?` unknown), far edge first."""
+    """Ego-centric view as 11 texts of 11 characters (`.` free, `#` blocked, `?` unknown), the far edge first."""
     cell_index = standable_cells(scene.reach).tolist().index(list(cell))
     pose = cell_index * rules.poses_per_cell + heading * len(rules.horizons)
     cells = ROW_FORMAT.view_cells(compile_table(scene, rules).rows[pose]).reshape(11, 11)
@@ -49,12 +49,15 @@ def view_picture(scene, cell, heading, rules=ROOMS):
 
 def test_ego_centric_view_of_a_drawn_room():
     room = [list("." * 13) for _ in range(9)]
-    room[3][6] = room[2][4] = "#"
+    room[3][6] = "#"
+    room[2][4] = "#"
     wardrobe = ("Wardrobe", 1.5, 1, 0.75, 0.3, 2, 0.3)
     chest = ("Chest", 1, 0.45, 0.5, 0.3, 0.9, 0.3)
-    # The wardrobe on [3, 6] hides what is right behind it, the chest on [2, 4] is too low. Half the field of view is
-    # 1.19 cells a step. The line to a cell one aside stays in the agent's column for half its way, where it meets the
-    # wardrobe 3 steps ahead if it goes on for 6 steps or more. The room ends after 8 steps.
+
+    # The wardrobe on [3, 6] hides the cells right behind it; the chest on [2, 4] is too low to hide any. Half the field
+    # of view is 1.19 cells a step. The line to a cell in the next column stays in the agent's column for half its
+    # length, so it meets the wardrobe, 3 steps ahead, if the cell is at least 6 steps ahead. The room ends after 8
+    # steps.
     assert view_picture(draw(["".join(row) for row in room], wardrobe, chest), (0, 6), 0) == [
         "####???####",
         "####???####",
@@ -78,8 +81,8 @@ def test_ego_centric_view_ends_at_a_wall():
 
 
 def test_ego_centric_view_along_a_diagonal():
-    # Heading 1 goes to +z +x. Cell [2, 2] is 2.83 cells ahead: 3 steps (2.12, rounded 2). Cell [3, 0] is 45 degrees to
-    # the left: 2 steps ahead and 2 aside (z = 0.71 x 4 = 2.83, rounded 3).
+    # Heading 1 points to +z +x. Cell [2, 2] is 2.83 cells ahead: 3 steps (2.12, rounded to 2). Cell [3, 0] is 45
+    # degrees to the left: 2 steps ahead and 2 to the side (z = 0.71 x 4 = 2.83, rounded to 3).
     room = ["." * 12, "." * 12, "..#.........", "#..........."] + ["." * 12] * 8
     picture = view_picture(draw(room), (0, 0), 1)[::-1]
     assert picture[:4] == ["?????.?????", "????...????", "???#....???", "??...#...??"]
@@ -89,17 +92,18 @@ def test_ego_centric_view_along_a_diagonal():
 @pytest.mark.parametrize("rules", [ROOMS, APARTMENTS, HOUSES])
 def test_ego_centric_view_of_a_mirrored_room_is_mirrored(rules):
     # With 12 headings, many offsets are halves: the cell 1 ahead at 30 degrees lies half a cell to the right.
-    draws = np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     for _ in range(5):
-        reach = draws.random((9, 9)) < 0.8
-        walls = draws.random((9, 9)) < 0.1
+        # A random room, its mirror image and the room turned by 180 degrees.
+        reach = rng.random((9, 9)) < 0.8
+        walls = rng.random((9, 9)) < 0.1
         reach &= ~walls
         scene = dataclasses.replace(draw(["." * 9] * 9), reach=reach, walls=walls)
         mirrored_scene = dataclasses.replace(scene, reach=reach[:, ::-1], walls=walls[:, ::-1])
         turned_scene = dataclasses.replace(scene, reach=reach[::-1, ::-1], walls=walls[::-1, ::-1])
 
         # From one cell, compare the views along every heading.
-        iz, ix = draws.permutation(standable_cells(reach))[0]
+        iz, ix = rng.permutation(standable_cells(reach))[0]
         for heading in range(rules.headings):
             picture = view_picture(scene, (iz, ix), heading, rules)
             mirrored_picture = view_picture(mirrored_scene, (iz, 8 - ix), -heading % rules.headings, rules)
@@ -110,9 +114,11 @@ def test_ego_centric_view_of_a_mirrored_room_is_mirrored(rules):
 
 @pytest.mark.parametrize("world", WORLDS)
 def test_the_cell_in_front_shows_whether_move_ahead_moves(world):
-    """With twelve headings, the cell nearest to the heading is another one, often free where the move is blocked."""
+    """With twelve headings, the cell nearest to the heading is another cell, often free while the move is blocked."""
     scene = make_generated_scenes(world, "train", 1)[0]
     task = WORLDS[world].task
+
+    # Poses in which the cell in front of the agent is free exactly if a move ahead leads to another pose.
     is_correct = {}
     for front_cell in ("nearest", "move"):
         rules = dataclasses.replace(task.rules, front_cell=front_cell)
@@ -120,6 +126,7 @@ def test_the_cell_in_front_shows_whether_move_ahead_moves(world):
         moves = bank.successor[:, MOVE_AHEAD] != np.arange(len(bank.rows))
         front_state = task.row_format.view_cells(bank.rows).reshape(-1, 11, 11)[:, 1, 5]
         is_correct[front_cell] = front_state == np.where(moves, VIEW_FREE, VIEW_BLOCKED)
+
     assert is_correct["move"].all()
     assert is_correct["nearest"].all() == (task.rules.headings == 8)
 
@@ -142,15 +149,17 @@ def test_compile_bank_skips_scenes_without_a_reachable_goal():
     near_scene = rename_scene("near", draw(["..", ".."], ("Book", 0, 1.5, 1, *SMALL)))
     task = Task(CATEGORIES)
 
-    # Two of six scenes are compiled; the other four are listed.
+    # Two of six scenes are compiled; the four skipped scenes are listed.
     bank = compile_bank([goalless_scenes[0], good_scene, *goalless_scenes[1:], near_scene], task)
-    assert (bank.task, bank.names) == (task, ("good", "near"))
+    assert bank.task == task
+    assert bank.names == ("good", "near")
     assert bank.skipped == ("empty", "nowhere", "too far", "not sought")
 
     # In the good room the book is 2 m away, so only the chair is a goal.
     assert bank.num_goals.tolist() == [1, 1]
     assert bank.goals[:, 0].tolist() == [CHAIR, BOOK]
-    assert (bank.first_cell.tolist(), bank.num_cells.tolist()) == ([0, 4], [4, 4])
+    assert bank.first_cell.tolist() == [0, 4]
+    assert bank.num_cells.tolist() == [4, 4]
     assert bank.successor[:64].max() < 64 <= bank.successor[64:].min()
 
     # Without any reachable goal there is no bank.
@@ -165,17 +174,21 @@ def test_compile_bank_uses_only_the_goals_of_the_task(rules):
     bank = compile_bank([scene], task)
     assert bank.goals[0, : bank.num_goals[0]].tolist() == [CHAIR]
     assert not bank.best_length[:, [BOOK, FRIDGE]].any()
-    # Books, which are no goal, are detected all the same.
+
+    # Books are not a goal, but they are detected.
     assert ROW_FORMAT.presence(bank.rows)[0].tolist() == [True, True, False]
+
+    # The fridge is too far from the only cell.
     with pytest.raises(InputError, match="Fridge"):
         compile_bank([scene], dataclasses.replace(task, goals=("Fridge",)))
 
 
 @pytest.mark.parametrize("rules", [ROOMS, HOUSES])
 def test_a_possible_goal_can_be_reached_from_every_cell(rules):
-    # Only a diagonal move leads to the last cell. The chair is near it and near the row, the book near the row alone.
+    # Only a diagonal move leads to the last cell. The chair is near it and near the row, the book only near the row.
     chair = ("Chair", 2.0, 1.0, 0.0, *SMALL)
-    scene = draw(["........#", "########."], chair, ("Book", 0.0, 1.0, 0.0, *SMALL))
+    book = ("Book", 0.0, 1.0, 0.0, *SMALL)
+    scene = draw(["........#", "########."], chair, book)
     task = Task(CATEGORIES, rules=dataclasses.replace(rules, success_distance=0.5), detector=PERFECT_DETECTOR)
     assert compile_bank([scene], task).num_goals.tolist() == [2]
 
@@ -187,7 +200,7 @@ def test_a_possible_goal_can_be_reached_from_every_cell(rules):
 
 @pytest.mark.parametrize(("rules", "checksum"), [(ROOMS, 0xFA3B430A), (Rules(headings=12), 0x6D3553F4)])
 def test_banks_keep_the_checksums_of_earlier_versions(rules, checksum):
-    """By them, earlier runs and benchmarks recognize their scenes. The figures are from before `front_cell`."""
+    """Stored runs and benchmarks recognize their scenes by checksum. These checksums are older than `front_cell`."""
     scene = draw(["...."], BOOK_AHEAD, ("Chair", 0.5, 1, 0.5, *SMALL))
     assert bank_checksum(compile_bank([scene], Task(CATEGORIES, rules=rules))) == checksum
 
@@ -196,9 +209,11 @@ def test_concatenated_banks_equal_the_bank_of_all_scenes():
     near_book = ("Book", 0, 1.5, 1, *SMALL)
     scenes = [draw(["..", ".."], near_book), draw(["..."], ("Chair", 0.25, 1.5, 1, *SMALL)), draw(["."], near_book)]
     task = Task(CATEGORIES, rules=ROOMS)
-    whole_bank = compile_bank(scenes, task)
-    joined_bank = concatenate_banks([compile_bank(scenes[:1], task), compile_bank(scenes[1:], task)])
-    assert whole_bank.first_cell.tolist() == [0, 4, 7]
-    for field_name, whole_field, joined_field in zip(whole_bank._fields, whole_bank, joined_bank, strict=True):
-        assert getattr(whole_field, "dtype", None) == getattr(joined_field, "dtype", None)
-        np.testing.assert_array_equal(whole_field, joined_field, err_msg=field_name)
+    expected_bank = compile_bank(scenes, task)
+    bank = concatenate_banks([compile_bank(scenes[:1], task), compile_bank(scenes[1:], task)])
+    assert expected_bank.first_cell.tolist() == [0, 4, 7]
+
+    # Every field has the expected dtype and values.
+    for field_name, expected_field, field in zip(bank._fields, expected_bank, bank, strict=True):
+        assert getattr(expected_field, "dtype", None) == getattr(field, "dtype", None)
+        np.testing.assert_array_equal(expected_field, field, err_msg=field_name)

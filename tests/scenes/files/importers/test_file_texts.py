@@ -1,4 +1,4 @@
-"""Blank lines, byte order marks, hidden files and forms of boxes, which all importers read by one rule."""
+"""Tests that all importers accept blank lines, byte order marks, hidden files and both forms of boxes."""
 
 import codecs
 import gzip
@@ -19,26 +19,26 @@ from support.scene_records import RECORD, assert_scenes_equal, scenes_and_errors
 from jaxnav.scenes.files.importers.ai2thor import read_replacements
 from jaxnav.scenes.files.importing import SceneFormat, read_source
 
-#: Two documents of each format that has one on every line.
-LINES: dict[SceneFormat, list[object]] = {
+#: Two documents of each format that stores one document a line.
+DOCUMENTS: dict[SceneFormat, list[object]] = {
     "procthor": [HOUSE, HOUSE],
     "ai2thor": [METADATA, METADATA | {"sceneName": "FloorPlan202_physics"}],
     "scenes": [RECORD, RECORD | {"name": "other"}],
 }
-BLANKS = ("", "  \t", "\r\n")
+BLANK_LINES = ("", "  \t", "\r\n")
 
 
 def scene_names(scene_format: SceneFormat, path: Path) -> list[str]:
-    """Return the names of the scenes of a file that has no error."""
+    """Names of the scenes of a file that is read without an error."""
     scenes, errors = scenes_and_errors(read_source(scene_format, str(path)))
     assert not errors
     return [scene.name for scene in scenes]
 
 
-def marked_lines(documents: list[object]) -> Iterator[tuple[str, bytes]]:
-    """Yield the documents one a line, with blank lines or byte order marks at different places."""
+def marked_contents(documents: list[object]) -> Iterator[tuple[str, bytes]]:
+    """Yield contents of the documents, one a line, with blank lines or byte order marks at different places."""
     texts = [json.dumps(document) for document in documents]
-    for blank in BLANKS:
+    for blank in BLANK_LINES:
         yield f"blank {blank!r} before", "\n".join([blank, *texts]).encode()
         yield f"blank {blank!r} between", f"\n{blank}\n".join(texts).encode()
         yield f"blank {blank!r} after", "\n".join([*texts, blank, ""]).encode()
@@ -47,22 +47,25 @@ def marked_lines(documents: list[object]) -> Iterator[tuple[str, bytes]]:
     yield "joined files with marks", b"".join(codecs.BOM_UTF8 + text.encode() + b"\r\n" for text in texts)
 
 
-@pytest.mark.parametrize("scene_format", LINES)
+@pytest.mark.parametrize("scene_format", DOCUMENTS)
 @pytest.mark.parametrize("compress", [bytes, gzip.compress])
 def test_importers_skip_blank_lines_and_byte_order_marks(tmp_path, scene_format, compress):
     source = tmp_path / ("scenes.jsonl" if compress is bytes else "scenes.jsonl.gz")
-    source.write_bytes(compress("\n".join(map(json.dumps, LINES[scene_format])).encode()))
+    documents = DOCUMENTS[scene_format]
+    source.write_bytes(compress("\n".join(map(json.dumps, documents)).encode()))
     expected_names = scene_names(scene_format, source)
     assert len(expected_names) == 2
-    for description, content in marked_lines(LINES[scene_format]):
+
+    # Blank lines and marks change nothing.
+    for description, content in marked_contents(documents):
         source.write_bytes(compress(content))
         assert scene_names(scene_format, source) == expected_names, description
 
 
 def test_replacements_and_their_rooms_may_have_blank_lines(tmp_path):
-    sets = {"name": "den", "columns": ["type", "x", "y", "z"], "sets": [[["Book", 0.0, 1.0, 0.0]]]}
-    sources = {"sets.jsonl": sets, "base.jsonl": RECORD}
-    for name, document in sources.items():
+    replacements = {"name": "den", "columns": ["type", "x", "y", "z"], "sets": [[["Book", 0.0, 1.0, 0.0]]]}
+    documents = {"sets.jsonl": replacements, "base.jsonl": RECORD}
+    for name, document in documents.items():
         (tmp_path / name).write_bytes(codecs.BOM_UTF8 + f"\n{json.dumps(document)}\n\n".encode())
     scenes, errors = scenes_and_errors(read_replacements(tmp_path / "sets.jsonl", tmp_path / "base.jsonl"))
     assert not errors
@@ -71,19 +74,21 @@ def test_replacements_and_their_rooms_may_have_blank_lines(tmp_path):
 
 @pytest.mark.parametrize("indent", [None, 1])
 def test_importers_skip_the_byte_order_mark_of_one_document(tmp_path, indent):
+    # Formats of one file.
     contents: dict[SceneFormat, object] = {"procthor": HOUSE, "ai2thor": METADATA, "habitat": EPISODES}
     for scene_format, content in contents.items():
         source = tmp_path / f"{scene_format}.json"
         source.write_bytes(codecs.BOM_UTF8 + json.dumps(content, indent=indent).encode())
         assert scene_names(scene_format, source)
 
+    # A format of a folder, in which every file has a mark.
     folder = tmp_path / "FloorPlan401"
     folder.mkdir()
     for name, content in FILES.items():
         (folder / name).write_bytes(codecs.BOM_UTF8 + json.dumps(content, indent=indent).encode())
     assert scene_names("scene-data", folder) == ["FloorPlan401"]
 
-    # Asset databases, too.
+    # An asset database, which gives the first object its size.
     asset_file = tmp_path / "assets.json"
     asset_file.write_bytes(codecs.BOM_UTF8 + json.dumps(ASSETS, indent=indent).encode())
     scenes, _ = scenes_and_errors(read_source("procthor", str(tmp_path / "procthor.json"), assets=asset_file))
@@ -91,34 +96,38 @@ def test_importers_skip_the_byte_order_mark_of_one_document(tmp_path, indent):
 
 
 def test_importers_of_folders_skip_hidden_files(tmp_path):
-    # An archive of macOS has a file `._NAME` beside each file and folder NAME.
+    # An archive of macOS has a file `._NAME` for each file and folder NAME.
     resource_fork = b"\x00\x05\x16\x07\x00\x02\x00\x00Mac OS X"
-    (tmp_path / "metadata").mkdir()
-    (tmp_path / "metadata" / "room.json").write_text(json.dumps(METADATA))
-    (tmp_path / "metadata" / "._room.json").write_bytes(resource_fork)
-    assert scene_names("ai2thor", tmp_path / "metadata") == ["FloorPlan201"]
+    metadata_folder = tmp_path / "metadata"
+    metadata_folder.mkdir()
+    (metadata_folder / "room.json").write_text(json.dumps(METADATA))
+    (metadata_folder / "._room.json").write_bytes(resource_fork)
+    assert scene_names("ai2thor", metadata_folder) == ["FloorPlan201"]
 
+    # A folder of episodes.
     write_json(tmp_path / "val" / "content" / "Home.json.gz", EPISODES)
     (tmp_path / "val" / "content" / "._Home.json.gz").write_bytes(resource_fork)
     assert scene_names("habitat", tmp_path / "val") == ["Home_floor0", "Home_floor1"]
 
-    for folder in ("FloorPlan401", "._FloorPlan401", ".cache"):
-        (tmp_path / "Scene_Data" / folder).mkdir(parents=True)
+    # Hidden folders are skipped even if they hold complete scenes.
+    for folder_name in ("FloorPlan401", "._FloorPlan401", ".cache"):
+        folder = tmp_path / "Scene_Data" / folder_name
+        folder.mkdir(parents=True)
         for name, content in FILES.items():
-            (tmp_path / "Scene_Data" / folder / name).write_text(json.dumps(content))
+            (folder / name).write_text(json.dumps(content))
     assert scene_names("scene-data", tmp_path / "Scene_Data") == ["FloorPlan401"]
 
 
 def test_boxes_may_be_given_by_their_corners(tmp_path, house_scene, read_metadata):
-    # Asset databases: the table is 1.0 x 0.8 x 0.6 m, with its corner anywhere.
+    # In an asset database only the size of a box counts: the table is 1.0 x 0.8 x 0.6 m.
     corners = {"min": point(-0.25, 0.0, -0.1), "max": point(0.75, 0.8, 0.5)}
     centre_and_size = {"center": point(0, 0.4, 0), "size": point(1.0, 0.8, 0.6)}
     for box in (corners, centre_and_size):
-        table = {"Dining_Table_27_1": {"objectType": "DiningTable", "boundingBox": box}}
-        scene = house_scene(HOUSE, ASSETS | table)
+        table_asset = {"Dining_Table_27_1": {"objectType": "DiningTable", "boundingBox": box}}
+        scene = house_scene(HOUSE, ASSETS | table_asset)
         np.testing.assert_allclose(scene.boxes, house_scene(HOUSE).boxes)
 
-    # Metadata: x 1 to 2, y 0.25 to 1.05 and z -0.6 to 0.6.
+    # In metadata the table spans x 1 to 2, y 0.25 to 1.05 and z -0.6 to 0.6.
     box = {"min": point(1.0, 0.25, -0.6), "max": point(2.0, 1.05, 0.6)}
     record = changed(METADATA, "objects", [TABLE | {"axisAlignedBoundingBox": box}])
     assert_scenes_equal(read_metadata(record), read_metadata(changed(METADATA, "objects", [TABLE])))
