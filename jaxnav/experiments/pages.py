@@ -9,6 +9,7 @@ results of every split (`tables`), the agents, and the functions of this module.
 import dataclasses
 import functools
 import math
+import re
 import traceback
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -115,8 +116,9 @@ def render_page(
 
 
 def result_sections(text: str) -> str:
-    """Parts of a page between two result marks."""
-    return "\n\n".join(section.strip() for section in text.split(RESULT_MARK)[1::2])
+    """Parts of a page between two result marks, without the HTML tags that only a browser reads."""
+    sections = "\n\n".join(section.strip() for section in text.split(RESULT_MARK)[1::2])
+    return re.sub(r"</?span[^>]*>", "", sections.replace("<br>", " "))
 
 
 def _load_template(template: str) -> jinja2.Template:

@@ -29,6 +29,7 @@ from jaxnav.experiments.pages import (
 )
 from jaxnav.experiments.table import Curve, ResultRow, ResultTable
 
+ROOT = Path(__file__).parents[2]
 AGENTS = {"main": {}, "anonymous": {"method": "anonymous", "arms": ["baseline"]}}
 CONFIG = ExperimentConfig(title="A title", agents=AGENTS)
 
@@ -775,3 +776,18 @@ def test_result_sections_are_the_parts_between_the_marks():
     text = f"head\n{RESULT_MARK}\nfirst\n{RESULT_MARK}\nbetween\n{RESULT_MARK}\nsecond\n{RESULT_MARK}\ntail"
     assert result_sections(text) == "first\n\nsecond"
     assert result_sections("no marks") == ""
+
+
+def test_result_sections_have_no_html_tags():
+    cells = '| <span class="idle">+5.0 [+4.0, +6.0]</span> | +1.0 [-1.0, +3.0]<br>**inconclusive** |'
+    text = f"{RESULT_MARK}\n{cells}\n{RESULT_MARK}"
+    assert result_sections(text) == "| +5.0 [+4.0, +6.0] | +1.0 [-1.0, +3.0] **inconclusive** |"
+
+
+@pytest.mark.parametrize("name", ["table2", "table3", "study", "claims", "belief", "few_scenes", "ladder", "ablations"])
+def test_stored_experiments_print_a_table(name):
+    """`jaxnav study NAME` prints the main results of the page that is stored."""
+    page = next(iter(parse_study([name]).pages))
+    sections = result_sections((ROOT / page).read_text(encoding="utf-8"))
+    assert "| --- |" in sections
+    assert "</" not in sections
