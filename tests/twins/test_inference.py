@@ -262,7 +262,7 @@ def follow_episode(
         pytest.param("vtnet", "streams", 12, marks=pytest.mark.exhaustive),
         *params_by_tier(
             (name, decision, NUM_EPISODES_BY_METHOD.get(name, NUM_EPISODES))
-            for name, decision in itertools.product(METHODS, DECISIONS)
+            for name, decision in itertools.product(TWINS, DECISIONS)
         ),
     ],
 )
