@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
+from support.processes import REPOSITORY
 from support.tiers import params_by_tier
 
 from jaxnav.experiments import pages
@@ -20,7 +21,6 @@ from jaxnav.policies.methods import find_method
 from jaxnav.policies.methods.local_policy import LocalPolicy
 from jaxnav.runs.config_files import apply_yaml
 
-ROOT = Path(__file__).parents[2]
 #: Experiments whose results are committed; the remaining experiments measure a run that the user gives.
 COMMITTED: dict[str, ExperimentConfig] = {}
 for _name in EXPERIMENTS:
@@ -32,7 +32,7 @@ for _name in EXPERIMENTS:
 @pytest.fixture(autouse=True)
 def skip_figures(monkeypatch):
     """Pages are written without drawing figures, from the root of the checkout, to which paths are relative."""
-    monkeypatch.chdir(ROOT)
+    monkeypatch.chdir(REPOSITORY)
 
     def name_figure(document, name, table, shifts, fields):
         return f"images/{document.stem}/{name}.png"
@@ -73,7 +73,7 @@ def test_every_committed_file_of_results_belongs_to_an_experiment():
         for split in ("val", "test"):
             split_config = dataclasses.replace(config, split=split)
             known_paths |= {config.results / split / f"{part.name}.jsonl" for part in list_all_parts(split_config)}
-    committed_paths = {path.relative_to(ROOT) for path in (ROOT / "results").rglob("*.jsonl")}
+    committed_paths = {path.relative_to(REPOSITORY) for path in (REPOSITORY / "results").rglob("*.jsonl")}
     assert committed_paths
     assert committed_paths <= known_paths
 

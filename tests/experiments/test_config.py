@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 from rich.console import Console
+from support.processes import REPOSITORY
 
 from jaxnav.errors import InputError
 from jaxnav.experiments.bench import Bench
@@ -25,7 +26,6 @@ from jaxnav.runs.config import RunConfig, check_config
 from jaxnav.runs.config_files import apply_yaml
 from jaxnav.runs.run import run_settings
 
-REPOSITORY = Path(__file__).parents[2]
 #: Experiments that measure finished runs.
 FINISHED_RUN_EXPERIMENTS = ("account", "cde", "mixture", "handover", "instrument")
 WORLDS = {"near": {"world": "rooms"}, "far": {"world": "apartments", "seeds": 4}}

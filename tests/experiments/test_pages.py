@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.processes import REPOSITORY
 
 from jaxnav.cli.study import parse_study
 from jaxnav.errors import InputError
@@ -29,7 +30,6 @@ from jaxnav.experiments.pages import (
 )
 from jaxnav.experiments.table import Curve, ResultRow, ResultTable
 
-ROOT = Path(__file__).parents[2]
 AGENTS = {"main": {}, "anonymous": {"method": "anonymous", "arms": ["baseline"]}}
 CONFIG = ExperimentConfig(title="A title", agents=AGENTS)
 
@@ -788,6 +788,6 @@ def test_result_sections_have_no_html_tags():
 def test_stored_experiments_print_a_table(name):
     """`jaxnav study NAME` prints the main results of the page that is stored."""
     page = next(iter(parse_study([name]).pages))
-    sections = result_sections((ROOT / page).read_text(encoding="utf-8"))
+    sections = result_sections((REPOSITORY / page).read_text(encoding="utf-8"))
     assert "| --- |" in sections
     assert "</" not in sections

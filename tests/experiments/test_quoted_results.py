@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from support.processes import REPOSITORY
 
 from jaxnav.experiments.pages import READING_MARK
 
-ROOT = Path(__file__).parents[2]
 #: A mean with its interval, such as `3.2 [1.4, 5.1]`, `81 [64, 97]`, `39.4 % [35.0, 43.8]` or `+0.1 [-1.5, +1.6]`.
 INTERVAL = re.compile(r"(?<![\w.])([-+]?[\d.]+)(?: ?%)?(?: points)? \[([-+]?[\d.]+), ([-+]?[\d.]+)\]")
 #: Texts that quote results, in addition to the summaries on the pages of experiments.
@@ -59,14 +59,14 @@ def json_texts(path: Path) -> list[str]:
 def known_quotes() -> set[Quote]:
     """All intervals that a text may quote: stored intervals, rounded, and the generated tables of pages."""
     quotes = set()
-    for path in (ROOT / "results").rglob("*.json*"):
+    for path in (REPOSITORY / "results").rglob("*.json*"):
         for json_text in json_texts(path):
             for mean, low, high in stored_intervals(json.loads(json_text)):
                 for digits in (0, 1, 2):
                     quotes.add((digits, round(mean, digits), round(low, digits), round(high, digits)))
 
     # The tables of a page are outside the text between its marks.
-    for path in (ROOT / "docs").glob("*.md"):
+    for path in (REPOSITORY / "docs").glob("*.md"):
         if f"docs/{path.name}" in SUMMARIES:
             continue
         generated_text = "".join(path.read_text().split(READING_MARK)[::2])
@@ -80,9 +80,9 @@ def written_texts() -> dict[str, str]:
     """Texts written by people, by file. Lines about `make run` are left out, because its results are not stored."""
     texts = {}
     for name in SUMMARIES:
-        lines = (ROOT / name).read_text().splitlines()
+        lines = (REPOSITORY / name).read_text().splitlines()
         texts[name] = "\n".join(line for line in lines if "`make run`" not in line)
-    for path in sorted((ROOT / "docs").glob("*.md")):
+    for path in sorted((REPOSITORY / "docs").glob("*.md")):
         parts = path.read_text().split(READING_MARK)
         if len(parts) == 3:
             texts[f"docs/{path.name}"] = parts[1]

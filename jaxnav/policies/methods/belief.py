@@ -12,8 +12,8 @@ squares C(t) around a target t, its score is the log of the probability of detec
 
 Scores are a sum, so eq. 1 is exact. *Direct* is `DirectScore`, which sees floor, walls and unexplored space and is
 alike for all categories; looks in vain belong to it. *Experience* is what a `Predictor` adds by the categories seen so
-far: the score under its belief less the direct score. Removing experience leaves the agent that knows places
-alone, bit for bit.
+far: the score under its belief less the direct score. Removing experience leaves the agent that knows places alone, bit
+for bit.
 
 Predictors:
   `LogLinear`: weights of the categories seen within 0.5, 1, 2 and 4 m of a square, and of the floor, for each goal.
@@ -181,7 +181,7 @@ class FloorPerceptron(nnx.Module):
 
 
 class DirectScore(nnx.Module):
-    """Where things are: the score of a square by floor, walls and unexplored space, alike for all categories.
+    """Score of a square by floor, walls and unexplored space, alike for all categories.
 
     Attributes:
       floor: perceptron with a single output.

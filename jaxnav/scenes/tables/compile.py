@@ -140,7 +140,7 @@ def compile_scene(scene: Scene, task: Task) -> Bank:
 
     # A category is a possible goal if every pose has a path to it: with four headings, cells that are only diagonal
     # neighbours are not connected. Padded to K entries, so that scenes can be joined.
-    is_possible_goal = (best_length > 0).all(axis=0) & (num_poses > 0)
+    is_possible_goal = best_length.all(axis=0) & (num_poses > 0)
     goals = np.flatnonzero(is_possible_goal).astype(np.int32)
     return Bank(
         task=task,
