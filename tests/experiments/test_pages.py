@@ -786,8 +786,8 @@ def test_result_sections_have_no_html_tags():
 
 @pytest.mark.parametrize("name", ["table2", "table3", "study", "claims", "belief", "few_scenes", "ladder", "ablations"])
 def test_stored_experiments_print_a_table(name):
-    """`jaxnav study NAME` prints the main results of the page that is stored."""
-    page = next(iter(parse_study([name]).pages))
-    sections = result_sections((REPOSITORY / page).read_text(encoding="utf-8"))
-    assert "| --- |" in sections
-    assert "</" not in sections
+    """`jaxnav study NAME` prints the main results of each page that is stored."""
+    for page in parse_study([name]).pages:
+        sections = result_sections((REPOSITORY / page).read_text(encoding="utf-8"))
+        assert "| --- |" in sections
+        assert "</" not in sections
