@@ -124,7 +124,7 @@ def main(run_dir: str, predictor_names: Sequence[str], penalty: float, num_searc
 
     # The layout's weights before the first view, as in a fit.
     goals = np.flatnonzero(agent_loop.env.task.is_goal())
-    prior = policies.knowledge.layout[-1]
+    prior = policies.knowledge.priors[-1]
     goal_weights = (prior / prior.sum(axis=-1, keepdims=True) + jnp.eye(len(prior))).T[goals]
     goal_inputs = (jnp.asarray(goals), goal_weights)
 

@@ -243,7 +243,7 @@ def _print_statistics(config: StatsConfig, console: Console) -> None:
     if run_config:
         task = run_config.task
         world = run_config.world
-        priors = np.asarray(load_policies(run_config).knowledge.layout, np.float64)
+        priors = np.asarray(load_policies(run_config).knowledge.priors, np.float64)
     else:
         task = config.task
         world = config.world_name

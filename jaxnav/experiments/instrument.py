@@ -128,7 +128,7 @@ def measure_scenes(
         return np.stack(scene_sums)
 
     # Measures without training, bank by bank. The scenes are read once, in order.
-    priors = np.asarray(policies.knowledge.layout, np.float64)
+    priors = np.asarray(policies.knowledge.priors, np.float64)
     scenes_in_order = (compiled_world.scenes[index] for index in range(len(compiled_world.scenes)))
     bank_measures = []
     for bank, bank_episodes in zip(compiled_world.banks, episode_lists, strict=True):

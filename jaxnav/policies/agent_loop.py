@@ -181,7 +181,7 @@ class Perception:
             return None
         # Rows of this room type; without evidence the tree has no leaves and stays None.
         cooccurrence = jax.tree.map(lambda leaf: leaf[room], knowledge.cooccurrence)
-        return LayoutEstimator(knowledge.layout[room], self.estimator_config, cooccurrence)
+        return LayoutEstimator(knowledge.priors[room], self.estimator_config, cooccurrence)
 
 
 def embed_and_decide(

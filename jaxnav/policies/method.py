@@ -35,12 +35,12 @@ class Knowledge(NamedTuple):
     """Statistics that are computed before training: traced, exported, never changed by training.
 
     Attributes:
-      layout: float32 [rooms, K, K], the layout prior alpha* of each room type.
+      priors: float32 [rooms, K, K], the layout prior alpha* of each room type.
       method: nested dict of arrays, the result of the method's `learn`; empty if it learns nothing.
       cooccurrence: evidence about the layout, leaves [rooms, K, K]; None for runs without the arm `layout`.
     """
 
-    layout: jax.Array
+    priors: jax.Array
     method: Tree = {}  # noqa: RUF012  (never written to)
     cooccurrence: CooccurrenceEvidence | None = None
 

@@ -86,7 +86,7 @@ class Policies(NamedTuple):
     @property
     def has_room_priors(self) -> bool:
         """True if the layout priors of two room types differ; those of homes are all equal."""
-        priors = np.asarray(self.knowledge.layout)
+        priors = np.asarray(self.knowledge.priors)
         return bool((priors != priors[0]).any())
 
     def supports_gap(self, gap: str) -> bool:
@@ -134,7 +134,7 @@ class Policies(NamedTuple):
                     "policy by its folder or its name"
                 )
             estimator_config = adapt_counts(ESTIMATORS[name], self.task)
-            knowledge = knowledge._replace(layout=layout_priors(self.prior_counts, estimator_config))
+            knowledge = knowledge._replace(priors=layout_priors(self.prior_counts, estimator_config))
             # Removal from a sum has forms of its own.
             if self.spec.method.has_additive_scores:
                 estimator_config = dataclasses.replace(estimator_config, form=self.estimator_config.form)
@@ -351,7 +351,7 @@ def _complete_fields(fields: dict[str, Any]) -> dict[str, Any]:
 
 def knowledge_to_arrays(knowledge: Knowledge) -> dict[str, Any]:
     """Return knowledge from before training as nested dicts of NumPy arrays, by groups of an export."""
-    arrays = {"layout": {"prior": np.asarray(knowledge.layout)}}
+    arrays = {"layout": {"prior": np.asarray(knowledge.priors)}}
     if knowledge.method:
         arrays["knowledge"] = jax.device_get(knowledge.method)
     if knowledge.cooccurrence is not None:
@@ -375,7 +375,7 @@ def knowledge_from_arrays(arrays: Mapping[str, Any]) -> Knowledge:
             None if near_log_odds is None else jnp.asarray(near_log_odds),
         )
     return Knowledge(
-        layout=jnp.asarray(arrays["layout"]["prior"]),
+        priors=jnp.asarray(arrays["layout"]["prior"]),
         method=jax.tree.map(jnp.asarray, arrays.get("knowledge", {})),
         cooccurrence=cooccurrence,
     )

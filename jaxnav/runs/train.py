@@ -432,7 +432,7 @@ def learn_knowledge(
 
     The evidence is learned in the training scenes of the first bank, and only where policies use the layout.
     """
-    layout = layout_priors(exploration.prior_counts, estimator_config)
+    priors = layout_priors(exploration.prior_counts, estimator_config)
 
     # The method's own knowledge, from the tables of all banks.
     learn = find_method(config.method).learn
@@ -440,7 +440,7 @@ def learn_knowledge(
     if learn is not None:
         method_knowledge = jax.tree.map(jnp.asarray, learn(compiled_world.banks, np.asarray(exploration.counts)))
     if "layout" not in config.arms:
-        return Knowledge(layout, method_knowledge)
+        return Knowledge(priors, method_knowledge)
 
     # Log odds that a pair of categories seen together indicates a shifted layout.
     key = jax.random.fold_in(jax.random.key(config.seed), _COOCCURRENCE)
@@ -458,7 +458,7 @@ def learn_knowledge(
     near_log_odds = learn_near_evidence(
         compiled_world.env, env_params, exploration.counts, near_key, num_walks, is_pooled
     )
-    return Knowledge(layout, method_knowledge, cooccurrence._replace(near_log_odds=near_log_odds))
+    return Knowledge(priors, method_knowledge, cooccurrence._replace(near_log_odds=near_log_odds))
 
 
 def fit_policies(

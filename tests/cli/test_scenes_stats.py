@@ -143,7 +143,7 @@ def test_scenes_stats_prints_the_layout_gap_to_the_priors_of_a_run(tmp_path_fact
 
     # Kitchens are the first room type, bathrooms the last.
     config = load_run_config(run_dir)
-    priors = np.asarray(load_policies(config).knowledge.layout)[[0, OTHER_ROOM, 3]]
+    priors = np.asarray(load_policies(config).knowledge.priors)[[0, OTHER_ROOM, 3]]
     counts = cooccurrence_counts(compile_bank(scenes, config.task))
     gaps = scene_layout_gap(counts, priors)
     similarities = scene_layout_similarity(counts, priors)

@@ -144,7 +144,7 @@ def test_uniform_weights_keep_the_weight_of_the_goal():
     """If the weights of all categories but the goal are uniform, their replacement changes nothing."""
     agent = start_agent(tiny.random_params(6), start_states(EPISODES), PARAMS)
     own_index = jnp.arange(len(EPISODES.goal))
-    num_categories = KNOWLEDGE.layout.shape[-1]
+    num_categories = KNOWLEDGE.priors.shape[-1]
 
     def replace_weights(goal_weight, other_weight):
         is_goal = jax.nn.one_hot(agent.state.goal, num_categories, dtype=bool)

@@ -166,7 +166,7 @@ def run_plain_loop(policy_index, episode, use_layout, epsilon, form) -> dict[str
     scene = int(EPISODES.scene[episode])
     goal = int(EPISODES.goal[episode])
     pose = int(EPISODES.pose[episode])
-    prior = KNOWLEDGE.layout[PARAMS.room[scene]]
+    prior = KNOWLEDGE.priors[PARAMS.room[scene]]
     weights = tiny.leaves_at(WEIGHTS, policy_index)
 
     # State and outcome at the start of the episode.

@@ -246,7 +246,7 @@ KNOWLEDGE = tiny.knowledge()
 UNGATED = EstimatorConfig(gate=False)
 #: `paper` updates on every row, `calibrated` has a gate that shuts, UNGATED has no gate. Their priors differ.
 ESTIMATORS = ("paper", "calibrated", UNGATED)
-PRIORS = jnp.stack([KNOWLEDGE.layout, 0.3 * KNOWLEDGE.layout, 2 * KNOWLEDGE.layout])
+PRIORS = jnp.stack([KNOWLEDGE.priors, 0.3 * KNOWLEDGE.priors, 2 * KNOWLEDGE.priors])
 NUM_STEPS = max(tiny.STEP_LIMITS) + 1
 KEY = jax.random.key(4)
 WEIGHTS = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(tiny.random_params, (6, 11)))
@@ -339,7 +339,7 @@ def test_traces_are_those_of_a_plain_loop():
 
             # The policy acts by its own estimate of the layout.
             row = jnp.asarray(tiny.BANK.rows[pose])
-            layout = tiny.believe(KNOWLEDGE.layout[room], layout, row)
+            layout = tiny.believe(KNOWLEDGE.priors[room], layout, row)
             weights = tiny.leaves_at(WEIGHTS, policy_index)
             decision, _ = tiny.decide(weights, row, goal, tiny.goal_weights(layout, goal), memory)
             action, pose = sample_step(policy_index, episode, time, pose, decision.logits)

@@ -118,7 +118,7 @@ def test_game_views_show_the_pose_belief_and_gap_of_an_agent():
     assert result.poses == poses_along(game, keys)
     assert result.poses == [view.pose for view in views]
 
-    prior = tiny.knowledge().layout[PARAMS.room[game.episode.scene[0]]]
+    prior = tiny.knowledge().priors[PARAMS.room[game.episode.scene[0]]]
     belief = None
     for view in views:
         belief = tiny.believe(prior, belief, tiny.BANK.rows[view.pose])

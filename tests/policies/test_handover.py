@@ -23,7 +23,7 @@ from jaxnav.policies.spatial_memory import SpatialMemory
 from jaxnav.runs.policies import Policies
 
 ENV, PARAMS = tiny.world()
-KNOWLEDGE = Knowledge(0.05 * tiny.knowledge().layout)
+KNOWLEDGE = Knowledge(0.05 * tiny.knowledge().priors)
 ANONYMOUS_SPEC = dataclasses.replace(tiny.SPEC, method=find_method("anonymous"), method_sizes=())
 #: Agents with experience, layout-blind agents, and pairs of an agent with experience and a layout-blind fallback.
 EXPERIENCED_LOOP = AgentLoop(ENV, tiny.SPEC, tiny.ESTIMATOR)
@@ -255,8 +255,8 @@ def test_own_fallback_replaces_the_counterfactual_memory():
 
 
 def make_policies(spec, params):
-    knowledge = Knowledge(KNOWLEDGE.layout)
-    return Policies(params, ("layout",), knowledge, knowledge.layout, spec, None, 0, tiny.BANK.task)
+    knowledge = Knowledge(KNOWLEDGE.priors)
+    return Policies(params, ("layout",), knowledge, knowledge.priors, spec, None, 0, tiny.BANK.task)
 
 
 def test_policies_that_always_had_experience_have_no_own_fallback():

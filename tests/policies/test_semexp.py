@@ -342,7 +342,7 @@ def test_nearest_frontier_finds_most_goals_of_homes_without_learning(world_name)
     bank = compile_bank([scenes[index] for index in range(3)], preset.task)
     env, params = build_environment(bank, {}, preset.step_limit)
     prior = jnp.ones((6, len(env.categories), len(env.categories)))
-    knowledge = make_knowledge(bank)._replace(layout=prior)
+    knowledge = make_knowledge(bank)._replace(priors=prior)
     agent_loop = make_agent_loop("jaxnav.policies.methods.semexp:NEAREST", env)
     start_state = start_states(draw_episodes(bank, num_episodes, seed=0))
 

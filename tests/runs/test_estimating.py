@@ -52,10 +52,10 @@ def test_with_estimator_keeps_fields_that_the_setting_does_not_name(drawn_run):
     assert policies.with_estimator(None) is policies
     evidence = policies.with_estimator("evidence")
     assert evidence.estimator_config == dataclasses.replace(policies.estimator_config, gap="evidence")
-    np.testing.assert_array_equal(evidence.knowledge.layout, policies.knowledge.layout)
+    np.testing.assert_array_equal(evidence.knowledge.priors, policies.knowledge.priors)
     released = policies.with_estimator("released")
     assert released.estimator_config == ESTIMATORS["released"]
-    np.testing.assert_array_equal(released.knowledge.layout, layout_priors(policies.prior_counts, "released"))
+    np.testing.assert_array_equal(released.knowledge.priors, layout_priors(policies.prior_counts, "released"))
 
 
 def test_with_estimator_refuses_gaps_without_learned_cooccurrence(drawn_run):

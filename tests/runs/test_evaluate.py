@@ -121,7 +121,7 @@ def test_homes_have_one_prior_for_all_room_types(drawn_run):
     room_counts = jnp.arange(policies.prior_counts.size, dtype=jnp.float32).reshape(policies.prior_counts.shape)
     home_counts = jnp.zeros_like(room_counts).at[OTHER_ROOM].set(room_counts[OTHER_ROOM])
     for counts, is_different in ((room_counts, True), (home_counts, False)):
-        knowledge = policies.knowledge._replace(layout=layout_priors(counts, policies.estimator_config))
+        knowledge = policies.knowledge._replace(priors=layout_priors(counts, policies.estimator_config))
         assert policies._replace(knowledge=knowledge).has_room_priors == is_different
 
 

@@ -147,7 +147,7 @@ def test_policy_is_found_by_name_and_as_an_object():
     for source in ("rooms-org", policy):
         subject = find_subject(source)
         assert isinstance(subject, PolicySubject)
-        layouts.append(subject.policies.knowledge.layout)
+        layouts.append(subject.policies.knowledge.priors)
         assert subject.config.world == "rooms"
         assert (subject.policies.arms, subject.policies.num_seeds) == (("layout",), 1)
     assert jnp.array_equal(*layouts)

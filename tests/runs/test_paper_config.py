@@ -128,7 +128,7 @@ def test_all_rooms_share_a_prior_of_ones_plus_the_counts_of_every_view():
             alpha[counts > 0] += counts
     np.fill_diagonal(alpha, 0)
 
-    priors = np.asarray(world.knowledge.layout)
+    priors = np.asarray(world.knowledge.priors)
     assert len(priors) > 1
     for prior in priors:
         np.testing.assert_array_equal(prior, alpha)
@@ -141,10 +141,10 @@ def test_belief_gap_and_weights_follow_equations_3_to_7(prior_kind):
     """The belief follows a twin in float64 along random views; after few sightings (`ones`) the gaps are large."""
     world = paper_world()
     rng = np.random.default_rng(0)
-    prior = world.knowledge.layout[0]
+    prior = world.knowledge.priors[0]
     if prior_kind == "ones":
         prior = jnp.ones_like(prior) - jnp.eye(NUM_CATEGORIES)
-    knowledge = world.knowledge._replace(layout=jnp.broadcast_to(prior, world.knowledge.layout.shape))
+    knowledge = world.knowledge._replace(priors=jnp.broadcast_to(prior, world.knowledge.priors.shape))
     twin = TwinPaperBelief(np.asarray(prior))
 
     update = jax.jit(world.perception.update)
@@ -287,7 +287,7 @@ def test_exported_policy_follows_the_belief_with_counts(counting_run):
     assert policy.task.instance_counts
 
     # The belief follows its twin along four views, of which the second occurs twice.
-    twin = TwinPaperBelief(np.asarray(policy.knowledge.layout[0]))
+    twin = TwinPaperBelief(np.asarray(policy.knowledge.priors[0]))
     memory = policy.init("kitchen")
     rows = paper_world().bank.rows
     decide = jax.jit(type(policy).decide)

@@ -234,7 +234,7 @@ def test_policy_init_selects_the_prior_of_the_room_type(drawn_run):
         memory = policy.init(room_type)
         layout_state = memory.perception_state.layout
         assert layout_state is not None
-        np.testing.assert_array_equal(layout_state.alpha, policy.knowledge.layout[prior_index])
+        np.testing.assert_array_equal(layout_state.alpha, policy.knowledge.priors[prior_index])
         assert int(memory.room) == prior_index
     assert len(ROOM_TYPES) == OTHER_ROOM
     with pytest.raises(InputError, match=r"^room_type 'cellar': choose one of kitchen, .*, or None$"):
@@ -319,7 +319,7 @@ def test_loaded_adaptive_or_controlled_policy_acts_as_in_the_evaluation(name):
     # Knowledge that the method learns in the tiny world before training.
     learned = {}
     if method.learn is not None:
-        learned = method.learn([tiny.BANK], np.ones(tiny.knowledge().layout.shape))
+        learned = method.learn([tiny.BANK], np.ones(tiny.knowledge().priors.shape))
     knowledge = tiny.knowledge()._replace(method=jax.tree.map(jnp.asarray, learned))
 
     # The episode as the evaluation plays it.

@@ -42,7 +42,7 @@ def test_exported_stream_policy_acts(drawn_run, stream_config, tmp_path):
     knowledge = drawn_policy.knowledge
     spec = stream_config.policy_spec(len(stream_config.task.categories))
     params = random_params(0, spec)
-    counts = jnp.ones_like(knowledge.layout)
+    counts = jnp.ones_like(knowledge.priors)
     exploration = Exploration(counts, counts, jnp.int32(1), jnp.int32(1))
     policy_dir = tmp_path / "policy"
     export_policy(policy_dir, stream_config, params, knowledge, drawn_policy.estimator_config, exploration)

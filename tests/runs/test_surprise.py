@@ -67,7 +67,7 @@ def test_permuted_evidence_gives_equal_gaps_for_renamed_categories(policies):
         learned = learned_gap(counts[0] > 0, evidence.log_odds[room])
         renamed_learned = learned_gap(renamed_counts[0] > 0, permuted_evidence.log_odds[room])
         np.testing.assert_allclose(renamed_learned, learned, rtol=1e-4)
-    np.testing.assert_array_equal(permuted_policies.knowledge.layout, policies.knowledge.layout)
+    np.testing.assert_array_equal(permuted_policies.knowledge.priors, policies.knowledge.priors)
 
 
 def gaps_by_world_positions(poses, bank, centres, task, near_log_odds):

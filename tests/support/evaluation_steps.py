@@ -9,7 +9,7 @@ from jaxnav.policies.method import Knowledge
 from support import tiny_world as tiny
 
 #: A weak prior: the belief follows the first views, so gaps are large.
-KNOWLEDGE = Knowledge(0.05 * tiny.knowledge().layout)
+KNOWLEDGE = Knowledge(0.05 * tiny.knowledge().priors)
 AGENT_LOOP = AgentLoop(tiny.world()[0], tiny.SPEC, tiny.ESTIMATOR)
 
 

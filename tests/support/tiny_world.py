@@ -77,7 +77,7 @@ def make_untrained_policies(spec=SPEC, learned_knowledge=None, task=BANK.task):
     """Policies without parameters, enough for callers that need only the method and its knowledge."""
     if learned_knowledge is None:
         learned_knowledge = knowledge()
-    prior_counts = jnp.zeros_like(learned_knowledge.layout)
+    prior_counts = jnp.zeros_like(learned_knowledge.priors)
     return Policies({}, (), learned_knowledge, prior_counts, spec, None, 0, task)
 
 

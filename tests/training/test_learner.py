@@ -180,7 +180,7 @@ def test_later_chunks_and_other_scalars_do_not_trace_again(first_update):
     other_scalars = SCALARS.replace(learning_rate=jnp.float32(0.1), entropy_weight=jnp.float32(0.5))
     train_one_update(states, other_scalars, PARAMS, KNOWLEDGE)
     other_params = PARAMS.replace(success_reward=jnp.float32(1))
-    train_one_update(states, SCALARS, other_params, Knowledge(2 * KNOWLEDGE.layout))
+    train_one_update(states, SCALARS, other_params, Knowledge(2 * KNOWLEDGE.priors))
     assert len(traced_chunks) == num_traces
 
 

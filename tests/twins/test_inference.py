@@ -202,7 +202,7 @@ def compare(
         prior = None
         if agent_loop.estimator_config:
             room = case.world.env_params.room[int(episodes.scene[number])]
-            prior = np.asarray(case.knowledge.layout[room])
+            prior = np.asarray(case.knowledge.priors[room])
         goal = int(episodes.goal[number])
         first_pose = int(episodes.pose[number])
         episode = TwinEpisode(policy, case.world.bank, prior, goal, first_pose)

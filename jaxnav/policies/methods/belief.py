@@ -117,7 +117,7 @@ class BeliefTracker(MapTracker):
     def update(self, state: SearchState, knowledge: Knowledge, percept: Percept) -> SearchState:
         """Draw a view on the map and count the looks."""
         next_state = super().update(state, knowledge, percept)
-        row_format = RowFormat(knowledge.layout.shape[-1])
+        row_format = RowFormat(knowledge.priors.shape[-1])
         view_table = learned_view_table(knowledge.method, row_format.view)
 
         # After a collision the view is the previous one, whose detections are no new evidence.

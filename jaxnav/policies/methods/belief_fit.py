@@ -128,7 +128,7 @@ def fit_belief(
 
     # Goals of the task, and the layout's weights before the first view. Homes have rooms of all types, and one prior.
     goals = jnp.asarray(np.flatnonzero(agent_loop.env.task.is_goal()))
-    estimator = LayoutEstimator(knowledge.layout[OTHER_ROOM])
+    estimator = LayoutEstimator(knowledge.priors[OTHER_ROOM])
     goal_weights = jax.vmap(estimator.goal_weights, (None, 0))(estimator.init(), goals)
     return fit_weights(agent_loop, params, snapshots, goals, goal_weights, key)
 

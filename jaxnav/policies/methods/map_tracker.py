@@ -326,7 +326,7 @@ class MapTracker:
         """Draw a view on the map and update the state of the search."""
         # Follow the agent by compass and odometry.
         strides = knowledge.method["steps"]
-        row_format = RowFormat(knowledge.layout.shape[-1])
+        row_format = RowFormat(knowledge.priors.shape[-1])
         stride = strides[percept.heading]
         position = (state.position + jnp.where(percept.moved, stride, 0)) % len(state.cells)
 
@@ -382,7 +382,7 @@ class MapTracker:
           int32 [], the new `SearchState.goal_sight`, and float32 [], the new `SearchState.success_distance`.
         """
         setup = knowledge.method
-        row_format = RowFormat(knowledge.layout.shape[-1])
+        row_format = RowFormat(knowledge.priors.shape[-1])
         goal = percept.goal
         size = len(state.cells)
 
