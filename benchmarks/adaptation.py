@@ -37,7 +37,7 @@ from jaxnav.policies.adaptation import (
 from jaxnav.policies.agent_loop import Agent, AgentLoop, policy_memory
 from jaxnav.policies.method import Knowledge
 from jaxnav.policies.network import Params
-from jaxnav.runs.evaluate import Results
+from jaxnav.runs.results import Results
 from jaxnav.runs.worlds import compile_evaluation_world
 
 NUM_EPISODES = 64

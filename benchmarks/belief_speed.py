@@ -29,9 +29,8 @@ from jaxnav.policies.methods.map_tracker import (
     WALL_BIT,
 )
 from jaxnav.policies.network import bind
-from jaxnav.runs.evaluate import draw_episode_lists
 from jaxnav.runs.policies import Policies, load_policy_as_run
-from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world
+from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world, draw_episode_lists
 
 NUM_STEPS = 50
 TURNS = 7

@@ -30,11 +30,12 @@ if TYPE_CHECKING:
     from jaxnav.registry import registered
     from jaxnav.runs.batch import train_batch
     from jaxnav.runs.config import RunConfig
-    from jaxnav.runs.evaluate import Sweep, evaluate, sweep
+    from jaxnav.runs.evaluate import evaluate
     from jaxnav.runs.policies import Policies
     from jaxnav.runs.policy import LoadedPolicy, PolicyOutput, load_policy
     from jaxnav.runs.results import Results
     from jaxnav.runs.run import Run
+    from jaxnav.runs.sweep import Sweep, sweep
     from jaxnav.runs.train import train
     from jaxnav.scenes.lattice import standable_cells
     from jaxnav.scenes.scene import CELL_SIZE, Scene
@@ -149,11 +150,12 @@ _NAMES_BY_MODULE = {
     "registry": ("registered",),
     "runs.batch": ("train_batch",),
     "runs.config": ("RunConfig",),
-    "runs.evaluate": ("Sweep", "evaluate", "sweep"),
+    "runs.evaluate": ("evaluate",),
     "runs.policies": ("Policies",),
     "runs.policy": ("LoadedPolicy", "PolicyOutput", "load_policy"),
     "runs.results": ("Results",),
     "runs.run": ("Run",),
+    "runs.sweep": ("Sweep", "sweep"),
     "runs.train": ("train",),
     "scenes.lattice": ("standable_cells",),
     "scenes.scene": ("CELL_SIZE", "Scene"),

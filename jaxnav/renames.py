@@ -62,7 +62,6 @@ MODULES = {
     "runs.progress": "runs.train",
     "runs.replay": "runs.evaluate",
     "runs.stopwatch": "runs.train",
-    "runs.sweep": "runs.evaluate",
     "runs.updates": "runs.train",
     "scenes.exchange": "scenes.layout_shift",
     "scenes.files.importers.controller": "scenes.files.importers.ai2thor",

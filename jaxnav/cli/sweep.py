@@ -27,7 +27,7 @@ from jaxnav.store.files import expand_home
 
 if TYPE_CHECKING:
     from jaxnav.evaluation.sweep_tables import ThresholdRow
-    from jaxnav.runs.evaluate import Sweep
+    from jaxnav.runs.sweep import Sweep
 
 DESCRIPTION = "Evaluate sTDE at many thresholds, for all seeds in one compiled call, and draw the result."
 #: Version of the JSON layout.
@@ -91,7 +91,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _run_sweep(config: SweepConfig, console: Console) -> None:
     """Evaluate, print the tables and write the files."""
-    from jaxnav.runs.evaluate import sweep_shifts
+    from jaxnav.runs.sweep import sweep_shifts
 
     # Check the options before anything is evaluated: an evaluation takes minutes.
     if not config.shift:

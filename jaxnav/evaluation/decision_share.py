@@ -250,16 +250,19 @@ class ShareProbe:
         return counts
 
 
-def share_interval(counted: np.ndarray, weighted_decisions: np.ndarray, scenes: Clusters) -> Interval:
+def share_interval(
+    counted: np.ndarray, weighted_decisions: np.ndarray, scenes: Clusters, *, trained: bool = True
+) -> Interval:
     """Compute the share of decisions, in percent, with its interval over scenes and training runs.
 
     Args:
       counted: int [S, E], weighted number of the decisions to count, by training run and episode.
       weighted_decisions: int [S, E], weighted number of all probed decisions.
       scenes: clusters of the E episodes.
+      trained: True to generalize to other training runs; False for the interval of these policies in other scenes.
 
     Returns:
-      The share over all runs, with that of every run in `seeds`; NaN without decisions.
+      The share over all runs, with that of every training run in `seeds`; NaN without decisions.
     """
     # Numerator and denominator leave out the same run and the same scene.
     runs = run_clusters(len(weighted_decisions))
@@ -269,6 +272,10 @@ def share_interval(counted: np.ndarray, weighted_decisions: np.ndarray, scenes: 
         return Interval(float("nan"))
     # Leaving out the only run leaves no decision; `jackknife_interval` then ignores the replicate.
     share_replicates = 100.0 * counted_replicates / np.maximum(decision_replicates, np.finfo(float).tiny)
+
+    # With fixed policies only scenes are left out.
+    if not trained:
+        return jackknife_interval(share_replicates[0], scenes)
 
     seed_shares = 100.0 * counted.sum(axis=1) / np.maximum(weighted_decisions.sum(axis=1), 1)
     return jackknife_interval(

@@ -23,8 +23,9 @@ from jaxnav.evaluation.variants import EvaluationRow
 from jaxnav.experiments.config import AgentRun, ExperimentConfig, agent_runs, part_settings
 from jaxnav.experiments.table import ResultRow, ResultTable, read_part
 from jaxnav.plain_console import to_plain_console
-from jaxnav.runs.evaluate import Results, evaluate
+from jaxnav.runs.evaluate import evaluate
 from jaxnav.runs.policies import load_policies
+from jaxnav.runs.results import Results
 from jaxnav.runs.run import Run, load_run_config, run_settings
 from jaxnav.runs.train import train
 from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world

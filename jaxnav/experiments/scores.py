@@ -23,8 +23,9 @@ from jaxnav.evaluation.variants import EvaluationRow, share_networks
 from jaxnav.experiments.bench import Bench, Scores
 from jaxnav.experiments.config import AgentRun
 from jaxnav.experiments.table import ResultRow
-from jaxnav.runs.evaluate import draw_episode_lists, has_same_episodes, measure_leads
+from jaxnav.runs.evaluate import has_same_episodes, measure_leads
 from jaxnav.runs.run import Run
+from jaxnav.runs.worlds import draw_episode_lists
 
 #: Comparisons within a run: a variant and its reference.
 VARIANT_COMPARISONS = (("layout", "baseline"), ("stde", "layout"), ("stde", "baseline"), ("tde", "layout"))

@@ -17,7 +17,7 @@ from jaxnav.baselines.shortest_path import oracle_actions
 from jaxnav.env.render import GOAL_CHARACTER, goal_cells, plan_characters
 from jaxnav.errors import InputError
 from jaxnav.game.session import Game, GameResult, GameView
-from jaxnav.runs.evaluate import find_scenes
+from jaxnav.runs.worlds import find_scenes
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import CELL_SIZE
 from jaxnav.scenes.tables.observation_row import VIEW_BLOCKED, VIEW_FREE, RowFormat, relative_position

@@ -14,8 +14,9 @@ from jaxnav.plain_console import PlainConsole
 from jaxnav.progress import show_activity
 from jaxnav.report.config import ReportConfig
 from jaxnav.report.replays import ReplayAgent, Replays, TrainedLayout, make_replays
-from jaxnav.runs.evaluate import Results, evaluate, measure_leads
+from jaxnav.runs.evaluate import evaluate, measure_leads
 from jaxnav.runs.policies import Policies
+from jaxnav.runs.results import Results
 from jaxnav.runs.run import Run
 from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world
 from jaxnav.training.calibration import layout_priors

@@ -25,9 +25,9 @@ from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.playback import EpisodeTrace
 from jaxnav.evaluation.variants import EvaluationRow
 from jaxnav.report.beliefs import SQUARE_SIZE, BeliefTracer, find_squares
-from jaxnav.runs.evaluate import find_scenes, replay_episodes
+from jaxnav.runs.evaluate import replay_episodes
 from jaxnav.runs.policies import Policies
-from jaxnav.runs.worlds import CompiledWorld
+from jaxnav.runs.worlds import CompiledWorld, find_scenes
 from jaxnav.scenes.categories import category_ids
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import Scene, scene_extent

@@ -1,12 +1,11 @@
 """Evaluation of runs, policies and agents on fixed episodes.
 
 `evaluate` measures every variant of the run's policies (baseline, layout weights, complete removal of experience, and
-soft removal at every epsilon) and returns `Results` with a report of the tables. `sweep` evaluates sTDE over many
-epsilons and all seeds in one compiled call, and `sweep_shifts` does so at several layout shifts. `measure_leads`
-compares results with those of layout-blind agents, and `replay_episodes` plays episodes step by step.
+soft removal at every epsilon) and returns `Results` with a report of the tables. `measure_leads` compares results with
+those of layout-blind agents, and `replay_episodes` plays episodes step by step.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
@@ -14,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
 from jaxnav.baselines.shortest_path import run_oracle
 from jaxnav.choices import (
@@ -23,7 +21,6 @@ from jaxnav.choices import (
     DEFAULT_REMOVALS,
     Costs,
     CounterfactualMemory,
-    Decoding,
     EstimatorName,
     Form,
     Removal,
@@ -31,7 +28,7 @@ from jaxnav.choices import (
 )
 from jaxnav.errors import InputError, check_choice
 from jaxnav.evaluation.episodes import EpisodeList, join_episode_lists
-from jaxnav.evaluation.grid import EpisodeOutcome, Evaluator, episode_metrics, start_states
+from jaxnav.evaluation.grid import EpisodeOutcome, Evaluator, start_states
 from jaxnav.evaluation.notes import budget_note, convergence_note, decision_share_notes, evaluation_notes
 from jaxnav.evaluation.playback import EpisodeTrace, play_episodes
 from jaxnav.evaluation.removal import InferenceConfig
@@ -43,7 +40,6 @@ from jaxnav.evaluation.report import (
     row_label,
 )
 from jaxnav.evaluation.statistics import paired_difference
-from jaxnav.evaluation.sweep_tables import ThresholdRow, sweep_notes, sweep_table, threshold_rows
 from jaxnav.evaluation.variants import (
     EvaluationRow,
     Replacement,
@@ -54,20 +50,15 @@ from jaxnav.evaluation.variants import (
     table_rows,
 )
 from jaxnav.plain_console import PlainConsole, to_plain_console
-from jaxnav.policies.methods import find_method, method_label
+from jaxnav.policies.methods import method_label
 from jaxnav.progress import show_activity
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.evaluate_agents import evaluate_agents
 from jaxnav.runs.policies import (
-    CONFIG_FILE,
     Policies,
-    is_policy,
-    list_packaged_policies,
-    load_policy_as_run,
 )
-from jaxnav.runs.policy import LoadedPolicy
 from jaxnav.runs.results import Results, build_result_rows
-from jaxnav.runs.run import Run, run_settings
+from jaxnav.runs.run import run_settings
 from jaxnav.runs.share_report import (
     build_decision_shares,
     count_shares,
@@ -76,7 +67,7 @@ from jaxnav.runs.share_report import (
     measure_costs,
     rows_with_shares,
 )
-from jaxnav.runs.subjects import AgentSubject, PolicySubject, find_subject, policy_in_memory_as_run
+from jaxnav.runs.subjects import AgentSubject, PolicySubject, find_subject
 from jaxnav.runs.worlds import (
     CompiledWorld,
     compile_evaluation_world,
@@ -84,12 +75,8 @@ from jaxnav.runs.worlds import (
     evaluation_shift,
     prefetch_env_params,
 )
-from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.worlds import WORLDS
 from jaxnav.store.files import expand_home
-
-#: Usual thresholds of a sweep.
-SWEPT_THRESHOLDS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 
 
 def evaluate(
@@ -198,7 +185,9 @@ def evaluate(
     rows = table_rows(epsilons, forms, policies.arms, removals, default_form)
     compiled = compiled or compile_evaluation_world(config, split, scenes, shift, console, world, shift_by)
     applied_shift = evaluation_shift(config, scenes or world, shift)
-    table = _evaluate_table(rows, costs, policies, compiled, episodes, applied_shift, seed, console)
+    # A single policy has no other training seeds, so its intervals are over scenes alone.
+    is_trained = found_subject.run is not None
+    table = _evaluate_table(rows, costs, policies, compiled, episodes, applied_shift, seed, console, trained=is_trained)
     results = Results(
         table.rows, table.outcome, table.episodes, compiled.env.categories, WORLDS[config.world].budgets, {}
     )
@@ -216,9 +205,8 @@ def evaluate(
     }
     names = {"method": method_label(config.method), "world": compiled.scenes[0].world, "split": split}
     report = build_report(
-        # A single policy has no other training seeds, so its intervals are over scenes alone.
-        build_result_rows(results, names, trained=found_subject.run is not None),
-        _build_differences(results, trained=found_subject.run is not None),
+        build_result_rows(results, names, trained=is_trained),
+        _build_differences(results, trained=is_trained),
         _write_notes(found_subject, policies, results, table.decision_shares),
         table.compilations,
         _subject_settings(found_subject, policies) | evaluation_settings,
@@ -254,11 +242,16 @@ def _evaluate_table(
     shift: float,
     seed: int,
     console: PlainConsole,
+    *,
+    trained: bool,
 ) -> _EvaluatedTable:
-    """Run all rows, the replacements of parts of their decisions, and the shortest path, on the same episodes."""
+    """Run all rows, the replacements of parts of their decisions, and the shortest path, on the same episodes.
+
+    Without `trained`, decision shares have intervals over scenes alone.
+    """
     # Rows that hand over to the policy itself are run apart.
     rows = [row for row in all_rows if not row.uses_own_fallback]
-    with show_activity(console, _describe_evaluation(num_episodes, shift)):
+    with show_activity(console, describe_evaluation(num_episodes, shift)):
         # Replacements are further rows of the same grid. The oracle reads the tables of every bank once more.
         episode_lists = draw_episode_lists(compiled, num_episodes, seed)
         replacements = list_cost_replacements(rows, costs)
@@ -273,9 +266,11 @@ def _evaluate_table(
         share_rows = rows_with_shares(rows)
         share_counts, probed_episodes = count_shares(share_rows, policies, compiled, episode_lists, seed)
     costs_by_replacement = measure_costs(
-        rows, outcome, replacements, replaced_outcome, episode_lists, max_room_episodes
+        rows, outcome, replacements, replaced_outcome, episode_lists, max_room_episodes, trained=trained
     )
-    decision_shares = build_decision_shares(share_rows, share_counts, probed_episodes, costs_by_replacement)
+    decision_shares = build_decision_shares(
+        share_rows, share_counts, probed_episodes, costs_by_replacement, trained=trained
+    )
 
     rows = [*rows, table_row("oracle", None, None, "argmax")]
     outcome = _append_row(outcome, oracle_outcome)
@@ -463,7 +458,7 @@ def check_seed(seed: int) -> None:
         raise InputError(f"--seed {seed}: give a whole number from 0 to 2**32 - 1")
 
 
-def _describe_evaluation(num_episodes: int, shift: float) -> str:
+def describe_evaluation(num_episodes: int, shift: float) -> str:
     """Words for the console while episodes are evaluated."""
     return f"evaluating {num_episodes:,} episodes at shift {shift:g}"
 
@@ -508,241 +503,6 @@ def _build_differences(results: Results, *, trained: bool) -> list[dict[str, Any
             )
             difference_rows.append(difference_row)
     return difference_rows
-
-
-class Sweep(NamedTuple):
-    """Results of a sweep over X thresholds, S seeds and E episodes, at one layout shift.
-
-    Attributes:
-      epsilon: float64 [X], thresholds.
-      sr, spl: float64 [X, S, E], in [0, 1].
-      dts: float64 [X, S, E], in metres.
-      outcome: outcomes of the episodes, leaves [X, S, E].
-      compilations: number of compilations; 1 where the scenes are in memory.
-      no_removal: outcomes of the same episodes without removal, leaves [S, E].
-      episodes: the episodes.
-      settings: settings of the sweep as JSON: source, method, split, layout shift, decoding and more.
-    """
-
-    epsilon: np.ndarray
-    sr: np.ndarray
-    spl: np.ndarray
-    dts: np.ndarray
-    outcome: EpisodeOutcome
-    compilations: int
-    no_removal: EpisodeOutcome
-    episodes: EpisodeList
-    settings: dict[str, Any]
-
-    def rows(self) -> list[ThresholdRow]:
-        """Mean of every metric at every threshold, and its difference to no removal, with 95 % intervals."""
-        return threshold_rows(
-            self.epsilon,
-            {"sr": self.sr, "spl": self.spl, "dts": self.dts},
-            episode_metrics(self.no_removal, self.episodes.best_length),
-            np.asarray(self.outcome.mean_weight, np.float64),
-            self.episodes,
-            self.settings["shift"],
-        )
-
-    def notes(self) -> list[str]:
-        """Notes on the coverage of the intervals, one sentence per note."""
-        return sweep_notes(self.sr.shape[1], self.episodes)
-
-    def table(self) -> Table:
-        """Table of SR and SPL by threshold for a terminal; print it with `rich.print`."""
-        return sweep_table(self.rows())
-
-
-def sweep(
-    source: Run | LoadedPolicy | str | Path,
-    epsilon: float | Sequence[float] | np.ndarray = SWEPT_THRESHOLDS,
-    params: Any = None,
-    *,
-    split: str = "val",
-    scenes: str | Path | None = None,
-    world: str | None = None,
-    shift: float | None = None,
-    shift_by: ShiftKind = "size",
-    episodes: int = 1000,
-    decoding: Decoding = "argmax",
-    form: Form | None = None,
-    setting: EstimatorName | None = None,
-    hold: bool = False,
-    seed: int = 0,
-    console: Console | None = None,
-) -> Sweep:
-    """Evaluate sTDE at every threshold and for every seed in one compiled call.
-
-    Args:
-      source: a finished run with the arm `layout`, or its directory; or a single policy of that arm, which counts as
-        one seed: a `LoadedPolicy`, the folder of an export, or the name of a packaged policy, such as `rooms-org`.
-      epsilon: thresholds [X]; no experience is removed for epsilon >= 1.
-      params: network parameters of your own, leaves [S, ...]; None for those of the source.
-      split, scenes, world, shift, shift_by, episodes, setting, hold, seed, console: as in `jaxnav.evaluate`. A policy
-        is evaluated in the generated world that it was trained for, unless `scenes` or `world` is given.
-      decoding: `argmax` for best actions, `sample` for sampled ones.
-      form: form in which sTDE combines the logits; None for the form of the layout estimator.
-
-    Raises:
-      InputError: the source is no finished run and no policy, it has no arm `layout`, or an argument is impossible.
-    """
-    (result,) = sweep_shifts(
-        source,
-        epsilon,
-        (shift,),
-        params,
-        split=split,
-        scenes=scenes,
-        world=world,
-        shift_by=shift_by,
-        episodes=episodes,
-        decoding=decoding,
-        form=form,
-        setting=setting,
-        hold=hold,
-        seed=seed,
-        console=console,
-    )
-    return result
-
-
-def sweep_shifts(
-    source: Run | LoadedPolicy | str | Path,
-    epsilon: float | Sequence[float] | np.ndarray = SWEPT_THRESHOLDS,
-    shifts: Sequence[float | None] = (0.0, 1.0),
-    params: Any = None,
-    *,
-    split: str = "val",
-    scenes: str | Path | None = None,
-    world: str | None = None,
-    shift_by: ShiftKind = "size",
-    episodes: int = 1000,
-    decoding: Decoding = "argmax",
-    form: Form | None = None,
-    setting: EstimatorName | None = None,
-    hold: bool = False,
-    seed: int = 0,
-    console: Console | None = None,
-) -> list[Sweep]:
-    """Sweep at several layout shifts; returns a `Sweep` for each.
-
-    Shifts whose scene tables have equal shapes share a compilation, which the first of them counts. For the other
-    arguments and errors see `sweep`.
-    """
-    check_seed(seed)
-    console = to_plain_console(console)
-    scenes = None if scenes is None else expand_home(scenes)
-    epsilons = np.atleast_1d(np.asarray(epsilon, np.float64))
-    if not len(epsilons):
-        raise InputError("--epsilon: give at least one number")
-    config, policies = _load_layout_policies(source, setting, hold)
-    estimator_config = policies.estimator_config
-    assert estimator_config is not None  # policies of the arm `layout` have an estimator
-
-    # Random numbers depend on `policy_index`. Repeating the layout parameters for every arm gives them the same index
-    # as in `evaluate`, and so both functions sample the same actions.
-    arm_names = config.arms
-    params = policies.params if params is None else params
-    repeated_params = jax.tree.map(lambda leaf: jnp.concatenate([jnp.asarray(leaf)] * len(arm_names)), params)
-    policies = policies._replace(params=repeated_params, arms=arm_names)
-
-    # One row for each threshold, and one without removal for the differences.
-    form = estimator_config.form if form is None else form
-    rows = [table_row("stde", float(threshold), form, decoding) for threshold in epsilons]
-    rows.append(table_row("layout", None, None, decoding))
-
-    results = []
-    evaluator = None
-    for shift in shifts:
-        applied_shift = evaluation_shift(config, scenes or world, shift)
-        compiled = compile_evaluation_world(config, split, scenes, shift, console, world, shift_by)
-        num_seeds = policies.num_seeds
-        seed_text = "1 seed" if num_seeds == 1 else f"{num_seeds} seeds"
-        console.print(f"shift {applied_shift:g}: {len(epsilons)} thresholds x {seed_text} x {episodes:,} episodes")
-
-        # The agent loop depends on the task and the policy alone, so one evaluator serves all shifts.
-        evaluator = evaluator or Evaluator(policies.make_agent_loop(compiled), has_controls=False)
-        earlier_compilations = evaluator.compilations
-        with show_activity(console, _describe_evaluation(episodes, applied_shift)):
-            episode_lists, outcome, compilations = evaluate_rows(rows, policies, compiled, episodes, seed, evaluator)
-
-        episode_list = join_episode_lists(episode_lists)
-        threshold_outcome = jax.tree.map(lambda leaf: leaf[:-1], outcome)
-        metrics = episode_metrics(threshold_outcome, episode_list.best_length)
-        sweep_settings = {
-            "source": _source_name(source),
-            "method": config.method,
-            "seeds": num_seeds,
-            "scenes": str(scenes or world or config.scene_source),
-            "split": split,
-            "shift": applied_shift,
-            "shift_by": shift_by,
-            "episodes": len(episode_list.goal),
-            "decoding": decoding,
-            "form": form,
-            "setting": setting,
-            "hold": hold,
-            "seed": seed,
-        }
-        result = Sweep(
-            epsilon=epsilons,
-            sr=metrics["sr"],
-            spl=metrics["spl"],
-            dts=metrics["dts"],
-            outcome=threshold_outcome,
-            compilations=compilations - earlier_compilations,
-            no_removal=jax.tree.map(lambda leaf: leaf[-1], outcome),
-            episodes=episode_list,
-            settings=sweep_settings,
-        )
-        results.append(result)
-    return results
-
-
-def _load_layout_policies(
-    source: Run | LoadedPolicy | str | Path, setting: EstimatorName | None, hold: bool
-) -> tuple[RunConfig, Policies]:
-    """Load the policies of the arm `layout` of a run, or a single policy; see `sweep`."""
-    # A single policy, with one seed.
-    if isinstance(source, LoadedPolicy):
-        config, policies = policy_in_memory_as_run(source)
-    elif not isinstance(source, Run) and is_policy(source):
-        config, policies = load_policy_as_run(source)
-    else:
-        run = _open_run(source)
-        config = run.config
-        if not find_method(config.method).hosts_layout:
-            raise InputError(
-                f"{config.run_dir}: method {config.method!r} cannot use the layout, which sTDE needs; give a run of "
-                "another method (`jaxnav list methods`)"
-            )
-        policies = run.policies(("layout",))
-    if policies.estimator_config is None:
-        raise InputError(
-            f"{_source_name(source)}: a policy of the arm 'baseline', which does not use the layout; give a policy of "
-            "the arm 'layout'"
-        )
-    return config, policies.with_estimator(setting, hold)
-
-
-def _open_run(source: Run | str | Path) -> Run:
-    """Open a run; text that names neither a run nor a policy is refused with the names of packaged policies."""
-    if isinstance(source, Run):
-        return source
-    if not (expand_home(source) / CONFIG_FILE).exists():
-        packaged_names = ", ".join(list_packaged_policies())
-        raise InputError(
-            f"{source}: neither a run directory ({CONFIG_FILE} is missing) nor an exported policy; train a run, or "
-            f"give a packaged policy: {packaged_names}"
-        )
-    return Run.open(source)
-
-
-def _source_name(source: Run | LoadedPolicy | str | Path) -> str:
-    if isinstance(source, Run):
-        return str(source.config.run_dir)
-    return f"{source.spec.method.name} policy" if isinstance(source, LoadedPolicy) else str(source)
 
 
 def measure_leads(results: Results, reference: Results) -> list[ExperienceLead]:
@@ -834,25 +594,3 @@ def replay_episodes(
         compiled_world.make_env_params(0),
         policies.knowledge,
     )
-
-
-def find_scenes(compiled_world: CompiledWorld, names: Collection[str]) -> dict[str, Scene]:
-    """Find scenes of a world by their names.
-
-    The scenes are read once, in order, because generated ones are generated anew at each access.
-
-    Raises:
-      LookupError: the world has no scene of a name.
-    """
-    missing_names = set(names)
-    scene_by_name: dict[str, Scene] = {}
-    for index in range(len(compiled_world.scenes)):
-        if not missing_names:
-            break
-        scene = compiled_world.scenes[index]
-        if scene.name in missing_names:
-            scene_by_name[scene.name] = scene
-            missing_names.remove(scene.name)
-    if missing_names:
-        raise LookupError(f"the world has no scene {min(missing_names)!r}")
-    return scene_by_name

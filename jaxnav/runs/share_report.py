@@ -115,6 +115,8 @@ def build_decision_shares(
     counts: ShareCounts,
     probed_episodes: EpisodeList,
     replacement_costs: dict[Replacement, dict[str, Any]],
+    *,
+    trained: bool = True,
 ) -> list[dict[str, Any]]:
     """Build the entries of the report, one for each row and part.
 
@@ -122,12 +124,13 @@ def build_decision_shares(
       rows: the R rows of the counts.
       counts, probed_episodes: result of `count_shares`.
       replacement_costs: costs as from `measure_costs`.
+      trained: False for intervals over scenes alone, see `share_interval`.
     """
     scenes = probed_episodes.clusters()
 
     def share_of(counted: jax.Array, weighted_decisions: jax.Array) -> dict[str, Any]:
         """Share of a row's decisions, from numbers [S, E]."""
-        return share_interval(np.asarray(counted), np.asarray(weighted_decisions), scenes).to_json()
+        return share_interval(np.asarray(counted), np.asarray(weighted_decisions), scenes, trained=trained).to_json()
 
     entries = []
     for row_index, row in enumerate(rows):
@@ -159,6 +162,8 @@ def measure_costs(
     replaced_outcome: EpisodeOutcome,
     episode_lists: Sequence[EpisodeList],
     max_room_episodes: int,
+    *,
+    trained: bool = True,
 ) -> dict[Replacement, dict[str, Any]]:
     """Measure what each replacement costs: factual less replaced, in percentage points, on the same episodes.
 
@@ -169,6 +174,7 @@ def measure_costs(
       replaced_outcome: outcomes with replacement, leaves [P, S, E].
       episode_lists: the episodes of each bank, E in total.
       max_room_episodes: number of episodes of each room type that the replacements ran, see `limit_room_episodes`.
+      trained: False for intervals over scenes alone, see `paired_difference`.
 
     Returns:
       By replacement, the number of `episodes`, and the intervals of `sr` and `spl`.
@@ -190,6 +196,7 @@ def measure_costs(
                 100.0 * metrics[metric][row_index],
                 episodes.clusters(),
                 same_runs=True,
+                trained=trained,
             )
             costs[replacement][metric] = difference.to_json()
     return costs

@@ -6,7 +6,7 @@ tables. A world with many scenes is streamed from disk: `draw_bank_order` draws 
 """
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import get_args
@@ -26,7 +26,7 @@ from jaxnav.progress import show_activity
 from jaxnav.runs.config import RunConfig
 from jaxnav.scenes.categories import count_unknown_types, format_most_common
 from jaxnav.scenes.context_exchange import ContextExchange
-from jaxnav.scenes.scene import SPLITS
+from jaxnav.scenes.scene import SPLITS, Scene
 from jaxnav.scenes.tables.compile import Bank, bank_checksum, compile_bank, concatenate_banks
 from jaxnav.scenes.tables.shards import Shards, compile_shards
 from jaxnav.scenes.worlds import (
@@ -333,3 +333,25 @@ def prefetch_env_params(compiled_world: CompiledWorld, order: Sequence[int]) -> 
             if turn_index + 1 < len(order) and order[turn_index + 1] != bank_index:
                 pending_params = thread_pool.submit(compiled_world.make_env_params, order[turn_index + 1])
             yield params
+
+
+def find_scenes(compiled_world: CompiledWorld, names: Collection[str]) -> dict[str, Scene]:
+    """Find scenes of a world by their names.
+
+    The scenes are read once, in order, because generated ones are generated anew at each access.
+
+    Raises:
+      LookupError: the world has no scene of a name.
+    """
+    missing_names = set(names)
+    scene_by_name: dict[str, Scene] = {}
+    for index in range(len(compiled_world.scenes)):
+        if not missing_names:
+            break
+        scene = compiled_world.scenes[index]
+        if scene.name in missing_names:
+            scene_by_name[scene.name] = scene
+            missing_names.remove(scene.name)
+    if missing_names:
+        raise LookupError(f"the world has no scene {min(missing_names)!r}")
+    return scene_by_name

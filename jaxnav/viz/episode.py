@@ -33,10 +33,10 @@ from jaxnav.plain_console import PlainConsole, to_plain_console
 from jaxnav.policies.methods import method_label
 from jaxnav.progress import show_activity
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.evaluate import find_scenes, replay_episodes
+from jaxnav.runs.evaluate import replay_episodes
 from jaxnav.runs.policies import Policies, is_policy, load_policies, load_policy_as_run
 from jaxnav.runs.run import load_run_config
-from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world, evaluation_shift
+from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world, evaluation_shift, find_scenes
 from jaxnav.scenes.categories import category_ids
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import Scene

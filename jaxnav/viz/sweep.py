@@ -12,7 +12,7 @@ from matplotlib.patches import Patch
 
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.policies.methods import method_label
-from jaxnav.runs.evaluate import Sweep
+from jaxnav.runs.sweep import Sweep
 from jaxnav.viz.style import (
     MUTED_COLOR,
     TEXT_COLOR,

@@ -11,7 +11,7 @@ from support.tiny_run import draw_run, tiny_config
 
 import jaxnav
 from jaxnav.cli.sweep import SweepConfig, _find_figure_path, main
-from jaxnav.runs.evaluate import SWEPT_THRESHOLDS
+from jaxnav.runs.sweep import SWEPT_THRESHOLDS
 
 OPTIONS = ("--epsilon", "0", "0.5", "--episodes", "24")
 

@@ -159,7 +159,7 @@ def test_result_console_does_not_wrap_in_a_pipe(monkeypatch, capsys):
     [
         (["train"], "runs.train.train"),
         (["eval", "RUN"], "runs.evaluate.evaluate"),
-        (["sweep", "rooms-org"], "runs.evaluate.sweep_shifts"),
+        (["sweep", "rooms-org"], "runs.sweep.sweep_shifts"),
         (["study", "account"], "experiments.driver.run_experiment"),
         (["report", "RUN"], "runs.run.Run.open"),
         (["episode", "RUN"], "viz.episode.play_episode"),

@@ -14,9 +14,9 @@ from jaxnav.errors import InputError
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.evaluation.variants import EvaluationRow
 from jaxnav.runs.config import RunConfig
-from jaxnav.runs.evaluate import sweep_shifts
 from jaxnav.runs.policies import POLICIES_DIR
 from jaxnav.runs.run import Run
+from jaxnav.runs.sweep import sweep_shifts
 
 #: Thresholds and number of episodes of `evaluated`.
 EPSILON = np.linspace(0, 1, 11)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from support.tiny_run import NUM_SEEDS, draw_run, tiny_config
 
-from jaxnav.runs.evaluate import sweep_shifts
+from jaxnav.runs.sweep import sweep_shifts
 from jaxnav.viz.sweep import sweep_figure
 
 EPSILON = (0.5, 0.0, 1.0)
