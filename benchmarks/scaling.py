@@ -42,11 +42,11 @@ from _setup import set_up_training
 from jax.experimental.multihost_utils import sync_global_devices
 from jax.sharding import Mesh, PartitionSpec
 
+from jaxnav.numerics.device_means import ENV_AXIS, SEED_AXIS
 from jaxnav.runs.config import LayoutConfig, RunConfig
 from jaxnav.store.checkpoint import save_checkpoint
 from jaxnav.store.files import append_log_rows, make_manifest
 from jaxnav.training.devices import Devices, is_first_process
-from jaxnav.training.shares import ENV_AXIS, SEED_AXIS
 
 NUM_EPISODES = 256
 #: Updates of a call, as in the default run.

@@ -73,7 +73,7 @@ class EstimatorConfig:
       hold: the gap never falls within an episode.
       decay: the gap is multiplied by this factor in [0, 1] in each pass with the gate shut.
       passes: passes over one view that a single `update` reproduces, >= 1. The released code makes two per step; the
-        second sees the same set and finds the gate shut, so that a new gap is already decayed once.
+        second sees the same set and finds the gate shut, so that a new gap is already decayed once. 1 without the gate.
       strength: sum of every prior row after rescaling, > 0; None keeps the sums of the counts.
       uniform: share of the uniform distribution mixed into every prior row, in [0, 1].
       form: form of eq. 2 that evaluations use by default, see `jaxnav.causal.stde`; no effect on the estimator.
@@ -108,6 +108,7 @@ class EstimatorConfig:
             ("increment", self.increment in range(1, 51), "a whole number from 1 to 50"),
             ("decay", 0 <= self.decay <= 1, "a number from 0 to 1"),
             ("passes", self.passes >= 1 and self.passes % 1 == 0, "a whole number of 1 or more"),
+            ("passes", self.gate or self.passes == 1, "1, because later passes are reproduced for the gate alone"),
             ("strength", self.strength is None or 0 < self.strength < float("inf"), "a number above 0, or None"),
             ("uniform", 0 <= self.uniform <= 1, "a number from 0 to 1"),
         ):

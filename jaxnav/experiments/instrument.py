@@ -48,14 +48,20 @@ LAYOUT_BLIND_MEASURES = (
 MAX_CHANGE = 5.0
 #: Least loss of agents that rely on the layout, in points.
 MIN_LOSS = 8.0
-#: Loss of layout-blind agents, in points, that is too large.
-LAYOUT_BLIND_LOSS = 2.0
+#: Largest loss of layout-blind agents, in points.
+MAX_LAYOUT_BLIND_LOSS = 2.0
 
 
 def measure_instrument(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
-    """Measure a run at every shift and compare the shifts, together with layout-blind agents if there are any."""
+    """Measure the baseline of a run at every shift and compare the shifts, with layout-blind agents if there are any.
+
+    Raises:
+      InputError: the run has no arm `baseline`, or see `require_layout_blind_run`.
+    """
+    if "baseline" not in run.config.arms:
+        raise InputError(f"{run.config.run_dir}: has no arm `baseline`, which `instrument` measures; give another run")
     bench.train(run)
-    policies = load_policies(run.config)
+    policies = load_policies(run.config, ("baseline",))
     layout_blind_policies = None
     if bench.layout_blind_run(run.world) is not None:
         layout_blind_run = require_layout_blind_run(bench, run)
@@ -436,5 +442,5 @@ def judge_shift(table: ResultTable, fields: Mapping[str, Any], shifts: Sequence[
     if table.has(fields, shift=shifts[0], metric=LAYOUT_BLIND_MEASURES[0]):
         for measure in LAYOUT_BLIND_MEASURES:
             loss = change_of(measure, shifts[-1])
-            criteria.append(Criterion("No loss if layout-blind", measure, (loss,), loss.mean < LAYOUT_BLIND_LOSS))
+            criteria.append(Criterion("No loss if layout-blind", measure, (loss,), loss.mean < MAX_LAYOUT_BLIND_LOSS))
     return criteria

@@ -255,7 +255,7 @@ def _run_removals(
     rules: Sequence[RemovalRule],
     remaining: RemainingDecision,
 ) -> RemovalOutcomes:
-    """Run the removals of a run and their controls in a mixed population; see `_measure_removals`."""
+    """Run the removals of a run and their controls in a mixed population; see `measure_removals`."""
     # Where scores are a sum, complete removal leaves an agent without any experience, and no other agent is needed.
     # Else the layout-blind agents meet the same episodes, in as many training runs.
     world, episodes, _ = population

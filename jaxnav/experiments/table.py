@@ -235,7 +235,8 @@ def _value_from_json(data: Mapping[str, Any]) -> Interval | Curve:
         high = np.array(data.get("high", undefined), np.float64)
         return Curve(np.array(data["positions"], np.float64), np.array(data["mean"], np.float64), low, high)
 
-    # The deviation over the training runs follows from their values.
+    # The deviation over the training runs follows from their values; that of two sides that were trained separately is
+    # not stored.
     seeds = tuple(data.get("seeds", ()))
     std = float(np.std(seeds, ddof=1)) if len(seeds) > 1 else math.nan
     low = float(data.get("low", math.nan))

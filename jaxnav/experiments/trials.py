@@ -280,7 +280,8 @@ def measure_variants(bench: Bench, run: AgentRun, shift: float) -> Iterator[Resu
 
 def measure_trials(bench: Bench, run: AgentRun, shift: float) -> Iterator[ResultRow]:
     """Evaluate all trials of a run at one shift, and relate its success to layout similarity."""
-    # On `test`, of all thresholds only the one that was chosen on `val` is evaluated; without one, nothing is trained.
+    # On `test`, only the threshold that was chosen on `val` is evaluated, beside those that were fixed beforehand
+    # (`STDE_OPTIONS`). Without a chosen one, nothing is trained.
     is_test = bench.config.split == "test"
     swept_thresholds = (bench.chosen_epsilon(run),) if is_test else bench.config.epsilon
     thresholds = {*swept_thresholds, *(options.epsilon for options in STDE_OPTIONS)}

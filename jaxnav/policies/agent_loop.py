@@ -6,6 +6,7 @@ a policy on these inputs. `AgentLoop` ties both to an environment: it starts B p
 without auto-reset.
 
     loop = AgentLoop(env, spec, estimator_config)
+    policy = loop.bind(params)
     agent = loop.start(start_key, num_envs, policy.initial_memory((num_envs,)), knowledge, env_params)
     inputs = loop.policy_inputs(agent, knowledge, env_params)
     decision = embed_and_decide(policy, inputs, policy_memory(agent))

@@ -7,6 +7,7 @@ training. Methods are found by name with `jaxnav.policies.methods.find_method`; 
 """
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 
@@ -299,7 +300,7 @@ class Method:
     Attributes:
       experience: module that makes Z, built with `(spec, rngs)`.
       perceive: map from all features to the features that the networks read; None for all. It may change the number of
-        categories.
+        categories if the method does not host the layout.
       tracker: memory of an episode without parameters.
       learn: function that computes `Knowledge.method`, a nested dict of arrays, from the banks of training scenes and
         co-occurrence counts float32 [rooms, K, K] (number of exploration poses that detect both categories).
@@ -344,3 +345,10 @@ class Method:
         shares = [stage.share for stage in self.stages]
         if not shares or min(shares) <= 0.0 or abs(sum(shares) - 1.0) > 1e-6:
             raise ValueError(f"the shares of the stages are {shares}; give shares above 0 that add up to 1")
+
+        # Episodes that begin in a stage without adaptation would inherit the fast weights of ended ones.
+        phases = [
+            adapts_online for adapts_online, _ in itertools.groupby(self.stages, lambda stage: stage.adapts_online)
+        ]
+        if self.adaptation is not None and phases.count(True) > 1:
+            raise ValueError("a stage without adaptation lies between stages with it; put this stage first or last")

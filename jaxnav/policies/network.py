@@ -241,6 +241,11 @@ class Policy(Stream):
         self.counterfactual_memory = spec.counterfactual_memory
         # A method may restrict what the networks see, down to the number of categories.
         perceived_spec = dataclasses.replace(spec, num_categories=self._num_perceived_categories())
+        if method.hosts_layout and perceived_spec.num_categories != spec.num_categories:
+            raise ValueError(
+                f"{method.name}: `perceive` returns {perceived_spec.num_categories} categories, and layout weights are "
+                f"of {spec.num_categories}; give the method `hosts_layout=False`"
+            )
 
         # Scene S: the view, the spatial memory and the method's inputs about the scene.
         num_scene_inputs = 2 * self.row_format.view**2 + method.experience.num_scene_inputs

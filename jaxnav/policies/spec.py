@@ -65,6 +65,9 @@ class PolicySpec:
       experience_dropout: whether a fused network was trained in some episodes without experience (Z = 0); two streams
         always are.
       counterfactual_memory: recurrent state from which the counterfactual branch decides.
+
+    Raises:
+      ValueError: a word is not among the options of its field, or two streams get a counterfactual memory of their own.
     """
 
     method: "Method"
@@ -82,6 +85,7 @@ class PolicySpec:
 
     def __post_init__(self) -> None:
         for name, options in (
+            ("direct", get_args(Direct)),
             ("decision", get_args(DecisionKind)),
             ("weight_kind", get_args(WeightKind)),
             ("counterfactual_memory", get_args(CounterfactualMemory)),

@@ -357,7 +357,7 @@ def fit_shift_classifier(
     A logistic regression on the pairs that a random walk has seen together distinguishes walks in the training scenes
     from the same walks with categories exchanged at random (`draw_category_exchange`). The scale of its log odds is
     calibrated in a quarter of the scenes, on log odds learned in the rest. A room type without scenes gets log odds of
-    0.
+    0, unless all room types share theirs.
 
     Args:
       env: the environment.

@@ -125,8 +125,10 @@ class PPOConfig:
         # Without guidance, the tables have no shortest paths, and the loss has no such term.
         guidance_weight, final_guidance_weight = None, None
         if self.has_guidance:
-            guidance_weight = jnp.float32(self.guidance)
-            final_guidance_weight = jnp.float32(self.guidance if self.final_guidance is None else self.final_guidance)
+            guidance_weight = jnp.float32(self.guidance or 0.0)
+            final_guidance_weight = guidance_weight
+            if self.final_guidance is not None:
+                final_guidance_weight = jnp.float32(self.final_guidance)
         return PPOScalars(
             learning_rate=jnp.float32(self.learning_rate) * lr_scale,
             gamma=jnp.float32(self.gamma),

@@ -29,8 +29,8 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxnav.errors import InputError
+from jaxnav.numerics.device_means import ENV_AXIS, SEED_AXIS
 from jaxnav.training.ppo import LearnerState
-from jaxnav.training.shares import ENV_AXIS, SEED_AXIS
 
 Tree = TypeVar("Tree")
 

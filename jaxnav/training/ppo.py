@@ -44,6 +44,7 @@ from jax.sharding import PartitionSpec
 
 from jaxnav.causal import do
 from jaxnav.env.objectnav import EnvParams, Observation
+from jaxnav.numerics.device_means import ENV_AXIS, masked_mean, mean_and_std, mean_over_devices
 from jaxnav.numerics.recurrence import UnrolledGRU, gru_step, unroll_gru
 from jaxnav.numerics.trees import tree_where
 from jaxnav.policies.agent_loop import Agent, AgentLoop, decide_counterfactually, embed_and_decide, policy_memory
@@ -60,7 +61,6 @@ from jaxnav.policies.pathways import (
     mask_experience,
 )
 from jaxnav.training.config import CounterfactualTraining, PPOConfig
-from jaxnav.training.shares import ENV_AXIS, masked_mean, mean_and_std, mean_over_devices
 
 Metrics = dict[str, jax.Array]
 #: Metrics that are means over the episodes that ended.
@@ -1015,9 +1015,9 @@ class Learner:
     @property
     def _stage_agent_loop(self) -> AgentLoop:
         """The agent loop of the stage, with or without adaptation."""
-        # None: the method's own number of adaptation steps; 0: no adaptation.
-        inner_steps = None if self.stage.adapts_online else 0
-        return dataclasses.replace(self.agent_loop, inner_steps=inner_steps)
+        if self.stage.adapts_online:
+            return self.agent_loop
+        return dataclasses.replace(self.agent_loop, inner_steps=0)
 
 
 def _with_fast_weights(agent: Agent, fast_weights: Any) -> Agent:

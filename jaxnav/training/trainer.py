@@ -20,11 +20,11 @@ import numpy as np
 from jax.sharding import Mesh
 
 from jaxnav.env.objectnav import EnvParams
+from jaxnav.numerics.device_means import SEED_AXIS
 from jaxnav.numerics.trees import count_array_bytes
 from jaxnav.policies.method import Knowledge, Stage
 from jaxnav.training.devices import replicate_on_devices, replicated_sharding, state_sharding
 from jaxnav.training.ppo import Learner, LearnerState, PPOScalars
-from jaxnav.training.shares import SEED_AXIS
 
 #: States by arm and seed, as in a checkpoint.
 SeedStates = dict[str, list[LearnerState]]

@@ -10,6 +10,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxnav.numerics.device_means import masked_mean
+
 
 def expert_actions(replay: Any) -> jax.Array:
     """Return the first action of a shortest path at every step of a rollout, int32 [T, B].
@@ -36,5 +38,6 @@ def imitation_loss(logits: jax.Array, expert: jax.Array) -> tuple[jax.Array, dic
     # The one-hot row of `NUM_ACTIONS` is zero.
     expert_one_hot = jax.nn.one_hot(expert, logits.shape[-1], dtype=jnp.float32)
     loss = -(expert_one_hot * jax.nn.log_softmax(logits)).sum(axis=-1).mean()
-    agreement = (logits.argmax(axis=-1) == expert).sum() / jnp.maximum((expert < logits.shape[-1]).sum(), 1)
+    has_expert = expert < logits.shape[-1]
+    agreement = masked_mean((logits.argmax(axis=-1) == expert).astype(jnp.float32), has_expert)
     return loss, {"imitation_loss": loss, "imitation_agreement": agreement}
