@@ -82,6 +82,7 @@ def build_row(
         scaled_metrics[metric_name] = to_report_units(metric_name, metric_values)
 
     # Each metric with its interval, bucket by bucket.
+    is_trained = trained and variant not in UNTRAINED_VARIANTS
     buckets: dict[str, dict[str, Any]] = {}
     for bucket_name, min_length in _LENGTH_BUCKETS.items():
         in_bucket = episodes.best_length >= min_length
@@ -89,12 +90,10 @@ def build_row(
         if in_bucket.any():
             clusters = scene_clusters(episodes.floor_plans[in_bucket], episodes.room[in_bucket])
             for metric_name, metric_values in scaled_metrics.items():
-                is_trained = trained and variant not in UNTRAINED_VARIANTS
                 interval = mean_interval(metric_values[:, in_bucket], clusters, trained=is_trained)
                 buckets[bucket_name][metric_name] = interval.to_json()
 
     # The interquartile mean of all episodes, which a few very good or bad homes do not decide.
-    is_trained = trained and variant not in UNTRAINED_VARIANTS
     interquartile_means = {}
     for metric_name in ("sr", "spl"):
         interval = interquartile_mean(scaled_metrics[metric_name], episodes.clusters(), trained=is_trained)

@@ -73,7 +73,7 @@ class Interval:
         interval_data: dict[str, Any] = {
             "mean": _nan_to_null(self.mean),
             "std": _nan_to_null(self.std),
-            "ci95": [self.low, _nan_to_null(self.high)] if self.has_bounds else None,
+            "ci95": [self.low, self.high] if self.has_bounds else None,
         }
         if self.seeds:
             interval_data["seeds"] = list(self.seeds)

@@ -139,10 +139,10 @@ def _trace_shift(
         compiled_world.make_env_params(0),
         policies.make_agent_loop(compiled_world),
         policies.knowledge,
-        list(estimators.values()),
-        jnp.stack(estimator_priors),
-        bench.config.steps,
-        jax.random.key(bench.config.seed),
+        estimators=list(estimators.values()),
+        priors=jnp.stack(estimator_priors),
+        num_steps=bench.config.steps,
+        key=jax.random.key(bench.config.seed),
     )
 
 
@@ -159,11 +159,12 @@ def truncate_to_shortest(traces: list[GapTraces]) -> list[GapTraces]:
 
 
 def trace_gaps(
-    weights: Params,
+    params: Params,
     episodes: EpisodeList,
     env_params: EnvParams,
     agent_loop: AgentLoop,
     knowledge: Knowledge,
+    *,
     estimators: Sequence[str | EstimatorConfig],
     priors: jax.Array,
     num_steps: int,
@@ -175,7 +176,7 @@ def trace_gaps(
     influences the policies.
 
     Args:
-      weights: parameters of the policies, leaves [N, ...].
+      params: parameters of the policies, leaves [N, ...].
       episodes: E episodes of one bank.
       env_params: parameters of the environment with that bank.
       agent_loop: environment, policy and its layout estimator.
@@ -187,7 +188,7 @@ def trace_gaps(
     """
     # [N, T + 1, estimators, 2, E] and [N, T + 1, E] become the shapes of `GapTraces`, with the time last.
     gap, running = _walk_episodes(
-        weights, start_states(episodes), env_params, agent_loop, knowledge, tuple(estimators), priors, num_steps, key
+        params, start_states(episodes), env_params, agent_loop, knowledge, tuple(estimators), priors, num_steps, key
     )
     return GapTraces(
         gap=np.asarray(gap).transpose(2, 3, 0, 4, 1),
@@ -198,7 +199,7 @@ def trace_gaps(
 
 @functools.partial(jax.jit, static_argnames=("agent_loop", "estimators", "num_steps"))
 def _walk_episodes(
-    weights: Params,
+    params: Params,
     start: State,
     env_params: EnvParams,
     agent_loop: AgentLoop,
@@ -229,8 +230,8 @@ def _walk_episodes(
 
     # One policy after the other walks all episodes, so that working memory does not grow with their number.
     def walk(indexed_policy: tuple[jax.Array, Params]) -> tuple[jax.Array, jax.Array]:
-        policy_index, policy_weights = indexed_policy
-        policy = agent_loop.bind(policy_weights)
+        policy_index, policy_params = indexed_policy
+        policy = agent_loop.bind(policy_params)
         policy_key = jax.random.fold_in(key, policy_index)
         episode_keys = jax.vmap(jax.random.fold_in, (None, 0))(policy_key, jnp.arange(num_episodes))
 
@@ -263,8 +264,8 @@ def _walk_episodes(
         _, (gaps, running) = jax.lax.scan(step, carry, length=num_steps + 1)
         return gaps, running
 
-    num_policies = jax.tree.leaves(weights)[0].shape[0]
-    return jax.lax.map(walk, (jnp.arange(num_policies), weights))
+    num_policies = jax.tree.leaves(params)[0].shape[0]
+    return jax.lax.map(walk, (jnp.arange(num_policies), params))
 
 
 def _sample_step(

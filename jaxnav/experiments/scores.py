@@ -191,7 +191,7 @@ def row_fields(run: AgentRun, shift: float | None, row: EvaluationRow) -> dict[s
         "decoding": "" if row.variant in UNTRAINED_VARIANTS else row.decoding,
         "shift": shift,
         "epsilon": row.epsilon,
-        "form": row.form or "" if is_stde else "",
+        "form": (row.form or "") if is_stde else "",
     }
 
 
@@ -318,7 +318,9 @@ def measure_groups(bench: Bench, run: AgentRun) -> Iterator[ResultRow]:
         if reference_agent:
             reference_agents = _evaluate_agents(bench, run.world, [reference_agent], shift)
         else:
-            reference_agents = members = [member for member in members if reference_variant in member]
+            # Agents without the reference variant are no members.
+            members = [member for member in members if reference_variant in member]
+            reference_agents = members
         references = [other[reference_variant] for other in reference_agents if reference_variant in other]
         if not members or not references:
             continue

@@ -112,15 +112,15 @@ class Trial:
             "control": self.control or "",
         }
 
-    def grid_cells(self, arms: Sequence[str], num_seeds: int) -> InferenceConfig:
+    def grid_entries(self, arms: Sequence[str], num_seeds: int) -> InferenceConfig:
         """Cells of the evaluation grid, leaves [S]; see `inference_grid`."""
         row = table_row(self.variant, self.epsilon, self.form, self.decoding)
-        cells = inference_grid([row], arms, num_seeds)
+        entries = inference_grid([row], arms, num_seeds)
 
         replaced = {}
         for name, value in self._control_settings().items():
             replaced[name] = jnp.broadcast_to(value, (num_seeds,))
-        return cells.replace(**replaced)
+        return entries.replace(**replaced)
 
     def _control_settings(self) -> dict[str, jax.Array]:
         """Fields of `InferenceConfig` that the control changes."""
@@ -166,8 +166,8 @@ def _given_gap(gap: float, begin: int, end: int) -> dict[str, jax.Array]:
 
 def trial_grid(trials: Sequence[Trial], arms: Sequence[str], num_seeds: int) -> InferenceConfig:
     """Cells of the evaluation grid for all trials, leaves [T S]."""
-    cells = [trial.grid_cells(arms, num_seeds) for trial in trials]
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *cells)
+    entries = [trial.grid_entries(arms, num_seeds) for trial in trials]
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *entries)
 
 
 # Running trials

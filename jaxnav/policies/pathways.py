@@ -127,7 +127,13 @@ class Decision(NamedTuple):
 
     def next_state(self, action: jax.Array) -> PolicyState:
         """Return the memory for the next step, given the action int32 [...] that was taken."""
-        return PolicyState(self.hidden, action, self.fast, self.use_experience, self.counterfactual_hidden)
+        return PolicyState(
+            hidden=self.hidden,
+            action=action,
+            fast=self.fast,
+            use_experience=self.use_experience,
+            counterfactual_hidden=self.counterfactual_hidden,
+        )
 
 
 PathwaysT = TypeVar("PathwaysT", Pathways, EncodedPathways)

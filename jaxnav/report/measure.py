@@ -102,10 +102,10 @@ def measure_shift(
                 compiled_world.make_env_params(0),
                 policies.make_agent_loop(compiled_world),
                 policies.knowledge,
-                [policies.estimator_config],
-                layout_priors(policies.prior_counts, policies.estimator_config)[None],
-                GAP_STEPS,
-                jax.random.key(config.seed),
+                estimators=[policies.estimator_config],
+                priors=layout_priors(policies.prior_counts, policies.estimator_config)[None],
+                num_steps=GAP_STEPS,
+                key=jax.random.key(config.seed),
             )
 
     # The number of replays is that of the whole page.

@@ -272,11 +272,11 @@ class Policies(NamedTuple):
         compiled_world.check_method(self.spec.method, self.knowledge)
         return AgentLoop(
             compiled_world.env,
-            self.spec,
-            self.estimator_config,
-            self.inner_steps,
-            self.fallback_spec,
-            self.use_own_fallback,
+            spec=self.spec,
+            estimator_config=self.estimator_config,
+            inner_steps=self.inner_steps,
+            fallback_spec=self.fallback_spec,
+            use_own_fallback=self.use_own_fallback,
         )
 
 

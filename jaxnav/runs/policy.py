@@ -190,7 +190,15 @@ class LoadedPolicy(struct.PyTreeNode):
         factual = decision.logits
         layout = perception_state.layout
         if layout is None or self.estimator_config is None:
-            return PolicyOutput(factual, factual, None, None, None, perception_state, decision)
+            return PolicyOutput(
+                logits=factual,
+                factual=factual,
+                counterfactual=None,
+                gap=None,
+                weights=None,
+                perception_state=perception_state,
+                decision=decision,
+            )
 
         # Counterfactual decision under do(S = 0, G = 0) with the factual experience, and its removal.
         counterfactual = decide_counterfactually(policy, pathways, memory.policy_state).logits

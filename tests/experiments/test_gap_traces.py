@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.stats import mannwhitneyu
 from support import tiny_world as tiny
 from support.episodes import episodes_in
-from support.intervals import around, left_out
+from support.intervals import student_interval, two_way_jackknife_interval
 from support.numerics import exact_kl
 
 from jaxnav.evaluation.episodes import EpisodeList, draw_episodes
@@ -108,8 +108,8 @@ def test_intervals_by_step_are_those_of_a_plain_loop():
     aucs = auc_by_step(shifted, unshifted)
     means = mean_by_step(unshifted)
     for step in (0, 1):
-        expected_auc = left_out(functools.partial(auc_without, step), num_scenes, num_runs)
-        expected_mean = left_out(functools.partial(mean_without, step), num_scenes, num_runs)
+        expected_auc = two_way_jackknife_interval(functools.partial(auc_without, step), num_scenes, num_runs)
+        expected_mean = two_way_jackknife_interval(functools.partial(mean_without, step), num_scenes, num_runs)
         assert aucs[:, 0, UPDATED, step] == pytest.approx(expected_auc)
         assert means[:, 0, FROZEN, step] == pytest.approx(expected_mean, rel=1e-5)
 
@@ -163,7 +163,7 @@ def test_scenes_of_a_floor_plan_are_left_out_of_both_shifts_at_once():
     reversed_names = unshifted.episodes.scenes[::-1]
     shifted = make_traces(np.tile(scenes[::-1, None] / 20 + 0.01, (2, 1, 1)), scenes, names=reversed_names)
     variance = 19 * (0.5 / 19 - 0.5 / 20) ** 2
-    assert first_step(auc_by_step(shifted, unshifted)) == pytest.approx(around(0.525, variance, 19))
+    assert first_step(auc_by_step(shifted, unshifted)) == pytest.approx(student_interval(0.525, variance, 19))
 
     # Copies of a floor plan with other objects are left out with it; other floor plans are not.
     for name_format, has_same_plans in (("room{:02}-replaced-1", True), ("other{:02}", False)):
@@ -181,7 +181,7 @@ def test_room_types_keep_their_shares():
     gaps = np.tile(np.array([0.1, 0.3, 0.6, 0.7, 0.8])[:, None], (2, 1, 1))
     for room, variance, degrees in (([1, 1, 0, 0, 0], 0.0028, 3), ([1, 1, 1, 1, 1], 0.085 / 5, 4)):
         means = mean_by_step(make_traces(gaps, range(5), room=room))
-        assert first_step(means) == pytest.approx(around(0.5, variance, degrees), rel=1e-5)
+        assert first_step(means) == pytest.approx(student_interval(0.5, variance, degrees), rel=1e-5)
 
 
 def test_a_policy_is_left_out_of_both_shifts_at_once():
@@ -192,7 +192,7 @@ def test_a_policy_is_left_out_of_both_shifts_at_once():
     # 0.9 > 0.5 and 0.3, 0.3 < 0.5, 0.3 = 0.3: 2.5 of 4. The AUC of the second policy is 0.5, that of the first is 1, so
     # the variance by run is 1 / 2 x (0.125^2 + 0.375^2), with one degree of freedom.
     variance = 0.5 * (0.125**2 + 0.375**2)
-    assert first_step(auc_by_step(shifted, unshifted)) == pytest.approx(around(0.625, variance, 1))
+    assert first_step(auc_by_step(shifted, unshifted)) == pytest.approx(student_interval(0.625, variance, 1))
 
     # Equal policies show no variance.
     equal_traces = make_traces(np.repeat([[0.9], [0.9]], 3, axis=1)[..., None], range(3))
@@ -279,7 +279,8 @@ STEP_LIMITS = np.array(tiny.STEP_LIMITS)[EPISODES.scene]
 
 
 def walk(weights) -> GapTraces:
-    return trace_gaps(weights, EPISODES, ENV_PARAMS, AGENT_LOOP, KNOWLEDGE, ESTIMATORS, PRIORS, NUM_STEPS, KEY)
+    settings = {"estimators": ESTIMATORS, "priors": PRIORS, "num_steps": NUM_STEPS, "key": KEY}
+    return trace_gaps(weights, EPISODES, ENV_PARAMS, AGENT_LOOP, KNOWLEDGE, **settings)
 
 
 def single_action_weights(action: int):

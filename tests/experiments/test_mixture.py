@@ -5,13 +5,15 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rich.console import Console
 from support.tiny_run import draw_run
 
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.grid import EpisodeOutcome
 from jaxnav.evaluation.statistics import Interval
-from jaxnav.experiments.config import join_folds
+from jaxnav.experiments.bench import Bench
+from jaxnav.experiments.config import ExperimentConfig, check_experiment, join_folds
 from jaxnav.experiments.mixture import (
     HARD_CONTROLS,
     LAYOUT_BLIND,
@@ -147,7 +149,7 @@ def test_clocks_remove_at_shares_of_the_budget():
         "constant 0.25": (0, NEVER, 0.25),
     }
     for name, expected in expected_gaps.items():
-        cell = trials[name].grid_cells(("layout",), 1)
+        cell = trials[name].grid_entries(("layout",), 1)
         assert (cell.gap_begin.item(), cell.gap_end.item(), cell.given_gap.item()) == expected
         assert cell.epsilon.item() == 0.0
 
@@ -182,52 +184,87 @@ def bench(make_bench, drawn_run):
     return make_bench(agents={"main": run, "anonymous": run}, shifts=(0.0, 1.0), episodes=8)
 
 
-@pytest.mark.exhaustive
-def test_mixture_measures_every_removal_at_both_shifts(bench):
-    # Only two rules are measured, because each estimator compiles again. The run has no evidence of sightings, so the
-    # table has no rules of the gap `surprise`.
-    rules = (REMOVAL_RULES[0], REMOVAL_RULES[-1])
+#: The rules of removal that the mixture of the drawn run measures; each estimator compiles again, so they are two.
+MEASURED_RULES = (REMOVAL_RULES[0], REMOVAL_RULES[-1])
+#: Fields of all rows of this mixture.
+MIXTURE_FIELDS = {"world": "rooms", "run": "main", "decoding": "sample"}
+
+
+@pytest.fixture(scope="module")
+def mixture_table(drawn_run, tmp_path_factory) -> ResultTable:
+    """Results of the removals with sampled actions, of the drawn run in rooms at both shifts."""
+    folder = tmp_path_factory.mktemp("mixture")
+    run = {"run": str(drawn_run.config.run_dir)}
+    config = ExperimentConfig(
+        results=folder / "results",
+        runs=folder / "runs",
+        worlds={"rooms": {}},
+        agents={"main": run, "anonymous": run},
+        shifts=(0.0, 1.0),
+        episodes=8,
+    )
+    bench = Bench(check_experiment(config), Console(quiet=True))
+
+    # The run has no evidence of sightings, so the table has no rules of the gap `surprise`.
     surprise_rules = [rule for rule in REMOVAL_RULES if rule.gap == "surprise"]
     assert surprise_rules
-    requested_rules = (*surprise_rules, *rules)
-    table = ResultTable(measure_removals(bench, bench.find_run("rooms", "main"), "sample", "own", requested_rules))
-    row_fields = {"world": "rooms", "run": "main", "decoding": "sample"}
-    assert {(row.world, row.run, row.decoding) for row in table.rows} == {("rooms", "main", "sample")}
-    assert {row.scenes for row in table.rows} == {4}
+    requested_rules = (*surprise_rules, *MEASURED_RULES)
+    return ResultTable(measure_removals(bench, bench.find_run("rooms", "main"), "sample", "own", requested_rules))
+
+
+def list_removals(table: ResultTable) -> list[str]:
+    return table.distinct("variant", MIXTURE_FIELDS, reference=WITHOUT_REMOVAL)
+
+
+@pytest.mark.exhaustive
+def test_mixture_measures_every_removal_at_both_shifts(mixture_table):
+    assert {(row.world, row.run, row.decoding) for row in mixture_table.rows} == {("rooms", "main", "sample")}
+    assert {row.scenes for row in mixture_table.rows} == {4}
 
     # The removals are TDE and the oracle, nine clocks, three controls of TDE, and the rules.
-    removals = table.distinct("variant", row_fields, reference=WITHOUT_REMOVAL)
+    removals = list_removals(mixture_table)
     assert removals[:2] == ["TDE", ORACLE_NAME]
-    assert removals[-2:] == [str(rule) for rule in rules]
+    assert removals[-2:] == [str(rule) for rule in MEASURED_RULES]
     assert len(removals) == 2 + 9 + 3 + 2
     assert removals[-5:-2] == list(HARD_CONTROLS)
 
-    # The oracle removes nothing at the first shift, and all experience at the last.
+
+@pytest.mark.exhaustive
+def test_oracle_of_a_mixture_removes_nothing_at_the_first_shift_and_all_experience_at_the_last(mixture_table):
     for shift, weight in ((0.0, 0.0), (1.0, 1.0)):
-        assert table.find(row_fields, variant="TDE", shift=shift, metric="weight").mean == 1.0
-        assert table.find(row_fields, variant=ORACLE_NAME, shift=shift, metric="weight").mean == weight
-    change_fields = {"reference": WITHOUT_REMOVAL, "metric": "sr"}
-    assert table.find(row_fields, change_fields, variant=ORACLE_NAME, shift=0.0).mean == 0.0
-    last_change = table.find(row_fields, change_fields, variant="TDE", shift=1.0)
-    assert table.find(row_fields, change_fields, variant=ORACLE_NAME, shift=1.0) == last_change
+        assert mixture_table.find(MIXTURE_FIELDS, variant="TDE", shift=shift, metric="weight").mean == 1.0
+        assert mixture_table.find(MIXTURE_FIELDS, variant=ORACLE_NAME, shift=shift, metric="weight").mean == weight
+    change_fields = MIXTURE_FIELDS | {"reference": WITHOUT_REMOVAL, "metric": "sr"}
+    assert mixture_table.find(change_fields, variant=ORACLE_NAME, shift=0.0).mean == 0.0
+    last_change = mixture_table.find(change_fields, variant="TDE", shift=1.0)
+    assert mixture_table.find(change_fields, variant=ORACLE_NAME, shift=1.0) == last_change
 
-    # Values, leads and changes add up, and the mixture weighs both shifts alike.
-    for metric in METRICS:
-        for shift in (0.0, 1.0):
-            values = {}
-            for variant in (LAYOUT_BLIND, WITHOUT_REMOVAL):
-                values[variant] = table.find(row_fields, variant=variant, shift=shift, metric=metric).mean
-            lead = table.find(row_fields, variant=WITHOUT_REMOVAL, reference=LAYOUT_BLIND, shift=shift, metric=metric)
-            assert lead.mean == pytest.approx(values[WITHOUT_REMOVAL] - values[LAYOUT_BLIND])
-        for removal in removals:
-            removal_fields = row_fields | {"variant": removal, "reference": WITHOUT_REMOVAL, "metric": metric}
-            changes = [table.find(removal_fields, shift=shift).mean for shift in (0.0, 1.0)]
-            assert table.find(removal_fields).mean == pytest.approx(sum(changes) / 2)
 
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("metric", METRICS)
+def test_values_leads_and_changes_of_a_mixture_add_up(mixture_table, metric):
+    for shift in (0.0, 1.0):
+        fields = MIXTURE_FIELDS | {"shift": shift, "metric": metric}
+        values = {}
+        for variant in (LAYOUT_BLIND, WITHOUT_REMOVAL):
+            values[variant] = mixture_table.find(fields, variant=variant).mean
+        lead = mixture_table.find(fields, variant=WITHOUT_REMOVAL, reference=LAYOUT_BLIND)
+        assert lead.mean == pytest.approx(values[WITHOUT_REMOVAL] - values[LAYOUT_BLIND])
+
+    # The mixture weighs both shifts equally.
+    for removal in list_removals(mixture_table):
+        removal_fields = MIXTURE_FIELDS | {"variant": removal, "reference": WITHOUT_REMOVAL, "metric": metric}
+        changes = [mixture_table.find(removal_fields, shift=shift).mean for shift in (0.0, 1.0)]
+        assert mixture_table.find(removal_fields).mean == pytest.approx(sum(changes) / 2)
+
+
+@pytest.mark.exhaustive
+def test_every_rule_of_a_mixture_is_compared_with_its_controls(mixture_table):
     # Every rule is compared with the gap of another episode, with the mean gap unless the rule is a switch, and with a
     # clock. Gaps by evidence also have a permuted control.
-    for rule, rule_controls in zip(rules, (["shuffled", "course"], ["shuffled"]), strict=True):
-        controls = table.distinct("control", row_fields, variant=str(rule), reference="control")
+    removals = list_removals(mixture_table)
+    for rule, rule_controls in zip(MEASURED_RULES, (["shuffled", "course"], ["shuffled"]), strict=True):
+        controls = mixture_table.distinct("control", MIXTURE_FIELDS, variant=str(rule), reference="control")
         assert controls[:-1] == rule_controls + [PERMUTED_CONTROL] * (rule.gap in EVIDENCE_GAPS)
         assert controls[-1] in removals[2:-5]
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.episodes import episodes_in
-from support.intervals import around, bounds
+from support.intervals import bounds, student_interval
 
 from jaxnav.errors import InputError
 from jaxnav.evaluation.grid import EpisodeOutcome
@@ -81,7 +81,7 @@ def test_inference_grid_holds_a_cell_per_row_and_seed():
 
 
 def test_controls_change_the_cells_of_stde_and_nothing_else():
-    plain_cells = Trial("stde", "sample", 0.5, "residual").grid_cells(ARMS, NUM_SEEDS)
+    plain_cells = Trial("stde", "sample", 0.5, "residual").grid_entries(ARMS, NUM_SEEDS)
     # Every control and every schedule changes few fields of the cells.
     given_gap = {"gap_source": GapSource.GIVEN, "given_gap": 1.0}
     changed_fields: dict[TrialControl | GapSchedule, dict[str, Any]] = {
@@ -101,7 +101,7 @@ def test_controls_change_the_cells_of_stde_and_nothing_else():
 
     # All further fields equal those of sTDE without a control.
     for control, changes in changed_fields.items():
-        cells = Trial("stde", "sample", 0.5, "residual", control, 7, 0.3).grid_cells(ARMS, NUM_SEEDS)
+        cells = Trial("stde", "sample", 0.5, "residual", control, 7, 0.3).grid_entries(ARMS, NUM_SEEDS)
         chex.assert_trees_all_equal_shapes_and_dtypes(cells, plain_cells)
         for name in vars(plain_cells):
             expected_values = np.broadcast_to(changes.get(name, getattr(plain_cells, name)), (NUM_SEEDS,))
@@ -113,7 +113,7 @@ def test_trial_grid_has_the_seeds_of_each_trial_in_turn():
     grid = trial_grid(trials, ARMS, NUM_SEEDS)
     assert {leaf.shape for leaf in jax.tree.leaves(grid)} == {(len(trials) * NUM_SEEDS,)}
     for index, trial in enumerate(trials):
-        chex.assert_trees_all_equal(select_cells(grid, index), trial.grid_cells(ARMS, NUM_SEEDS))
+        chex.assert_trees_all_equal(select_cells(grid, index), trial.grid_entries(ARMS, NUM_SEEDS))
 
 
 # Rows of results
@@ -194,11 +194,11 @@ def test_trial_rows_compare_layout_with_baseline_and_further_trials_with_layout(
     # sTDE less + w is 0, 100, 0, 0 points in the first run and 0, 0, 0, -100 in the second. The variance by run is
     # 1250 / 2 = 625; by scene, with means of 0, 50, 0 and -50, 5000 / 3 / 4 = 417; by residual, which is 25 or -25 in
     # all eight, 8 x 625 / 3 / 8 = 208. The total of 417 + 625 - 208 = 833 has
-    # 833^2 / (417^2 / 3 + 625^2 / 1 + 208^2 / 3) = 1.51 degrees of freedom.
+    # 833^2 / (417^2 / 3 + 625^2 / 1 + 208^2 / 3) = 1.50 degrees of freedom.
     components = np.array([5000 / 12, 625, 5000 / 24])
     variance = components[0] + components[1] - components[2]
     degrees = variance**2 / (components**2 / [3, 1, 3]).sum()
-    assert bounds(stde_gain) == pytest.approx(around(0, variance, degrees))
+    assert bounds(stde_gain) == pytest.approx(student_interval(0, variance, degrees))
 
     # Only outcomes of equal decoding are compared, and the baseline is not compared.
     assert not table.where(MAIN_FIELDS | BEST_LAYOUT.row_fields(), reference="baseline").rows
@@ -231,7 +231,7 @@ def test_intervals_are_over_floor_plans_of_a_room_type():
     outcome = make_outcome([[0, 0, 1, 1, 0, 1]] * 2, length, np.zeros((2, 6), np.float32))
     table = ResultTable(TrialOutcomes({LAYOUT: outcome}, episodes).trial_rows(MAIN_FIELDS, ""))
     interval = table.find(MAIN_FIELDS | LAYOUT.row_fields(), metric="sr")
-    assert bounds(interval) == pytest.approx(around(50, 2500 / 3, 2))
+    assert bounds(interval) == pytest.approx(student_interval(50, 2500 / 3, 2))
 
 
 def test_sum_by_scene_leaves_out_scenes_without_episodes():
