@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from jaxnav.scenes.categories import category_ids
 from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import CELL_SIZE, Scene, scene_extent
-from jaxnav.scenes.tables.observation_row import MAX_RANGE, RowFormat, relative_position
+from jaxnav.scenes.tables.observation_row import MAX_RANGE, RowFormat, relative_position, turn_offsets
 from jaxnav.scenes.tables.visibility import SIGHT_MARGIN, cell_centres, clear_of_walls
 from jaxnav.scenes.task import Rules, Task
 
@@ -160,9 +160,7 @@ def _find_detected_sites(
 
     # World positions of the detections.
     cell, heading, _ = rules.split_pose(pose)
-    forward = rules.heading_directions()[heading]
-    rightward = np.stack([forward[:, 1], -forward[:, 0]], axis=-1)
-    positions = centres[cell] + ahead[:, None] * forward + right[:, None] * rightward
+    positions = centres[cell] + turn_offsets(ahead, right, rules.heading_directions()[heading])
 
     detected_site = np.full(detections.shape[:2], -1, np.int16)
     detected_site[pose, category] = nearest_site.query(positions)[1]

@@ -32,7 +32,7 @@ from jaxnav.policies.pathways import NO_ACTION, Decision, Pathways, PolicyInputs
 from jaxnav.policies.spatial_memory import ExplorationMap, SpatialMemory
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.scene import CELL_SIZE
-from jaxnav.scenes.tables.observation_row import RowFormat, relative_position
+from jaxnav.scenes.tables.observation_row import RowFormat, relative_position, turn_offsets
 from jaxnav.scenes.task import Rules
 
 
@@ -153,10 +153,9 @@ class Perception:
         """
         # Axes of the compass: x to the right and z ahead at heading 0.
         forward = jnp.asarray(self.rules.heading_directions(), jnp.float32)[heading]
-        rightward = jnp.stack([forward[1], -forward[0]])
         detections = self.row_format.detections(row).astype(jnp.float32)
         ahead, right = relative_position(detections)  # [K] each
-        offsets = ahead[:, None] * forward[None] + right[:, None] * rightward[None]
+        offsets = turn_offsets(ahead, right, forward[None])
 
         # A move leads to the next cell in the direction of the heading.
         move_step = jnp.asarray(self.rules.move_steps(), jnp.float32)[heading, ::-1]  # (z, x) to (x, z)

@@ -18,7 +18,7 @@ from jaxnav.scenes.categories import (
     ROBOTHOR_CATEGORIES,
     ROBOTHOR_GOALS,
 )
-from jaxnav.scenes.tables.observation_row import Detector, RowFormat
+from jaxnav.scenes.tables.observation_row import Detector, RowFormat, turn_offsets
 
 #: Names of the actions; an action is an index into them.
 ACTIONS = ("MoveAhead", "RotateLeft", "RotateRight", "LookUp", "LookDown", "Done")
@@ -124,10 +124,9 @@ class Rules:
         Returns:
           int [H, A, B, 2], (dz, dx) from the agent's cell, by heading.
         """
-        # Forward and rightward unit vectors of each heading, as (z, x) like the cells.
-        forward = self.heading_directions()[:, None, None, ::-1]  # [H, 1, 1, (z, x)]
-        rightward = np.stack([-forward[..., 1], forward[..., 0]], axis=-1)
-        return np.rint(forward * ahead[:, None, None] + rightward * right[:, None]).astype(int)
+        forward = self.heading_directions()[:, None, None]  # [H, 1, 1, 2]
+        offsets = turn_offsets(ahead[:, None], right, forward)
+        return np.rint(offsets[..., ::-1]).astype(int)  # (x, z) to (z, x)
 
     def move_steps(self) -> np.ndarray:
         """Return the displacement of MoveAhead for each heading, int [H, 2], (dz, dx).

@@ -33,7 +33,7 @@ from jaxnav.policies.methods.semexp import cell_positions
 from jaxnav.policies.network import Params, init_params
 from jaxnav.scenes.scene import CELL_SIZE
 from jaxnav.scenes.tables.compile import Bank
-from jaxnav.scenes.tables.observation_row import RowFormat, relative_position
+from jaxnav.scenes.tables.observation_row import RowFormat, relative_position, turn_offsets
 
 if TYPE_CHECKING:
     from jaxnav.policies.methods.belief import TargetPolicy
@@ -139,8 +139,7 @@ def locate_objects(bank: Bank) -> HomeObjects:
     num_categories = len(bank.task.categories)
     row_format = RowFormat(num_categories)
     lattice = cell_positions(bank.ahead, rules.move_steps())
-    forward = rules.heading_directions()[:, ::-1]  # (z, x)
-    rightward = np.stack([-forward[:, 1], forward[:, 0]], axis=-1)
+    forward = rules.heading_directions()
 
     positions_by_home = []
     categories_by_home = []
@@ -152,7 +151,7 @@ def locate_objects(bank: Bank) -> HomeObjects:
         pose_index, category = np.nonzero(detections[..., 0])
         ahead, right = relative_position(detections[pose_index, category])
         cell, heading, _ = rules.split_pose(poses[pose_index])
-        offsets = ahead[:, None] * forward[heading] + right[:, None] * rightward[heading]
+        offsets = turn_offsets(ahead, right, forward[heading])[:, ::-1]  # (z, x)
         reported_cells = lattice[cell] + np.rint(offsets / CELL_SIZE).astype(int)
 
         # Cells with enough reports of a category.

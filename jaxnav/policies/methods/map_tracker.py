@@ -23,6 +23,7 @@ from jaxnav.scenes.tables.observation_row import (
     VIEW_FREE,
     RowFormat,
     relative_position,
+    turn_offsets,
 )
 from jaxnav.scenes.task import MOVE_AHEAD, FrontCell, Rules
 
@@ -144,10 +145,9 @@ def detection_cells(
     detections = row_format.detections(row).astype(jnp.float32)
     ahead, right = relative_position(detections)
 
-    # Turn the offsets by the heading; directions are (z, x).
-    forward = jnp.asarray(Rules(headings=headings).heading_directions(), jnp.float32)[heading][::-1]
-    rightward = jnp.stack([-forward[1], forward[0]])
-    offsets = (ahead[:, None] * forward[None] + right[:, None] * rightward[None]) / CELL_SIZE
+    # Turn the offsets by the heading, (x, z), to those of the map, (z, x).
+    forward = jnp.asarray(Rules(headings=headings).heading_directions(), jnp.float32)[heading]
+    offsets = turn_offsets(ahead, right, forward[None])[:, ::-1] / CELL_SIZE
     return (position[None] + jnp.rint(offsets).astype(jnp.int32)) % size
 
 

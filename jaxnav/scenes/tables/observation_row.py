@@ -164,6 +164,22 @@ def relative_position(detections: Any) -> tuple[Any, Any]:
     return detections[..., 1] / AHEAD_SCALE, (detections[..., 2] - RIGHT_ORIGIN) / RIGHT_SCALE
 
 
+def turn_offsets(ahead: Any, right: Any, forward: Any) -> Any:
+    """Return the world offsets of places ahead and to the right of an agent, arrays of NumPy or JAX.
+
+    Args:
+      ahead, right: float [...], metres or cells.
+      forward: float [..., 2], unit vector (x, z) of the agent's heading, of as many axes as the result.
+
+    Returns:
+      float [..., 2], world (x, z), in the unit of `ahead`.
+    """
+    # Headings turn clockwise from +z, so the right of (x, z) is (z, -x).
+    signs = np.array([1.0, -1.0], forward.dtype).reshape((1,) * (forward.ndim - 1) + (2,))
+    rightward = forward[..., ::-1] * signs
+    return ahead[..., None] * forward + right[..., None] * rightward
+
+
 def detected_positions(detections: np.ndarray, agent_position: np.ndarray, forward: np.ndarray) -> np.ndarray:
     """Return the world positions of detections from one pose.
 
@@ -176,8 +192,7 @@ def detected_positions(detections: np.ndarray, agent_position: np.ndarray, forwa
       float64 [..., 2], world (x, z).
     """
     ahead, right = relative_position(detections)
-    rightward = np.array([forward[1], -forward[0]])
-    return agent_position + ahead[..., None] * forward + right[..., None] * rightward
+    return agent_position + turn_offsets(ahead, right, forward)
 
 
 @dataclasses.dataclass(frozen=True)

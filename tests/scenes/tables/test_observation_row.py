@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.scenes.tables.observation_row import RowFormat
+from jaxnav.scenes.tables.observation_row import RowFormat, turn_offsets
 
 
 @pytest.mark.parametrize(("num_categories", "num_bytes"), [(22, 128), (37, 192)])
@@ -61,3 +61,12 @@ def test_row_format_refuses_counts_that_its_rows_do_not_hold():
             row_format.pack(detections, view, given_counts)
     with pytest.raises(ValueError, match="these rows hold no instance counts; compile the scenes with"):
         RowFormat(3).counts(RowFormat(3).pack(detections, view))
+
+
+@pytest.mark.parametrize("array", [np.asarray, jnp.asarray])
+def test_offsets_turn_clockwise_with_the_heading(array):
+    # 2 ahead and 1 to the right, as (x, z): facing +z (1, 2), facing +x (2, -1), facing -z (-1, -2).
+    ahead = array(np.full(3, 2.0, np.float32))
+    right = array(np.ones(3, np.float32))
+    forward = array(np.array([[0.0, 1.0], [1.0, 0.0], [0.0, -1.0]], np.float32))
+    np.testing.assert_array_equal(turn_offsets(ahead, right, forward), [[1.0, 2.0], [2.0, -1.0], [-1.0, -2.0]])
