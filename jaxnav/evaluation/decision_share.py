@@ -16,6 +16,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 
 from jaxnav.causal import do
 from jaxnav.env.objectnav import EnvParams, State
@@ -76,7 +77,7 @@ def is_changed(logits: jax.Array, changed_logits: jax.Array) -> jax.Array:
     """
     log_probs = jax.nn.log_softmax(logits)
     changed_log_probs = jax.nn.log_softmax(changed_logits)
-    kl = (jnp.exp(log_probs) * (log_probs - changed_log_probs)).sum(axis=-1)
+    kl = optax.losses.kl_divergence_with_log_targets(changed_log_probs, log_probs)
     return (logits.argmax(axis=-1) != changed_logits.argmax(axis=-1)) & (kl > MIN_KL)
 
 

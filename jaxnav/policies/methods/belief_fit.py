@@ -21,6 +21,7 @@ from jaxnav.layout import LayoutEstimator
 from jaxnav.policies.agent_loop import AgentLoop, policy_memory
 from jaxnav.policies.method import Knowledge
 from jaxnav.policies.methods.belief_map import MapSquares, read_squares
+from jaxnav.policies.methods.local_policy import wrapped_offset
 from jaxnav.policies.methods.map_tracker import (
     NUM_LOOK_DISTANCES,
     SQUARE_CELLS,
@@ -286,7 +287,7 @@ def count_looks(
     detected_squares = detection_cells(*view, rules.headings, size) // SQUARE_CELLS
     num_squares = size // SQUARE_CELLS
     own_detection = detected_squares[jnp.minimum(categories, num_categories - 1)]
-    separation = jnp.abs((squares - own_detection + num_squares // 2) % num_squares - num_squares // 2).max(axis=-1)
+    separation = jnp.abs(wrapped_offset(own_detection, squares, num_squares)).max(axis=-1)
     is_close = jnp.zeros(num_categories + 1, bool).at[categories].max(separation <= 1)[:num_categories]
     is_hit = row_format.presence(row) & is_close
 

@@ -170,11 +170,11 @@ def _locate_goal(state: SearchState) -> GoalLocation:
 
 def _squared_distances(position: jax.Array, size: int) -> jax.Array:
     """Return the squared distances of all cells from one cell, in units of cells, int32 [N, N]."""
-    row_squares, column_squares = jnp.square(_wrapped_offset(position[:, None], jnp.arange(size)[None], size))
+    row_squares, column_squares = jnp.square(wrapped_offset(position[:, None], jnp.arange(size)[None], size))
     return row_squares[:, None] + column_squares[None]
 
 
-def _wrapped_offset(start: jax.Array, end: jax.Array, size: int) -> jax.Array:
+def wrapped_offset(start: jax.Array, end: jax.Array, size: int) -> jax.Array:
     """Return the shorter displacement between two positions on a toroidal map."""
     return (end - start + size // 2) % size - size // 2
 
@@ -182,7 +182,7 @@ def _wrapped_offset(start: jax.Array, end: jax.Array, size: int) -> jax.Array:
 def _nearest_heading(start: jax.Array, end: jax.Array, headings: int, size: int) -> jax.Array:
     """Return the heading int32 [] that points most directly from one cell to another."""
     directions = jnp.asarray(Rules(headings=headings).heading_directions()[:, ::-1], jnp.float32)  # (z, x)
-    return (directions @ _wrapped_offset(start, end, size).astype(jnp.float32)).argmax()
+    return (directions @ wrapped_offset(start, end, size).astype(jnp.float32)).argmax()
 
 
 def _plan_path(targets: jax.Array, unexplored: jax.Array, state: SearchState) -> tuple[PathField, jax.Array]:
