@@ -361,6 +361,12 @@ def test_estimator_config_refuses_values_out_of_range(field, valid_values, inval
             EstimatorConfig(**{field: value})
 
 
+def test_several_passes_need_the_gate():
+    # Later passes only let a gap decay behind the shut gate. Without a gate, they would count the view again.
+    with pytest.raises(ValueError, match="passes is 2: give 1"):
+        EstimatorConfig(passes=2, gate=False)
+
+
 def test_prior_needs_two_categories():
     with pytest.raises(ValueError, match="categories"):
         prior_from_counts(jnp.ones((1, 1)))

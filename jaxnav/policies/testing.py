@@ -177,6 +177,8 @@ def _check_tracker_states(
                 goal=agent.state.goal[i],
             )
             tracker_state = update(tracker_state, percept)
+            # Training carries the state from step to step, so an update must keep its shapes and dtypes.
+            chex.assert_trees_all_equal_shapes_and_dtypes(tracker.init(knowledge), tracker_state)
             # The state that the agent carries must be that of a single update per step.
             agent_tracker_state = _member(agent.perception.tracker_state, i)
             chex.assert_trees_all_equal_shapes_and_dtypes(agent_tracker_state, tracker_state)

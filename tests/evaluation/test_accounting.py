@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support.intervals import bounds
 
 from jaxnav.evaluation.report import remaining_share
 from jaxnav.evaluation.statistics import scene_clusters
@@ -28,7 +29,7 @@ def test_remaining_share_of_a_fixed_share_is_exact(share):
     layout_blind = np.broadcast_to(draw_results(generator, 0.6)[:1], agent.shape)
     interval = remaining_share(layout_blind, agent, layout_blind + share * (agent - layout_blind), CLUSTERS)
     # With agent a, layout-blind agent b and share s: (b + s (a - b) - b) / (a - b) = s under all weights.
-    np.testing.assert_allclose((interval.mean, interval.low, interval.high), 100 * share, atol=1e-9)
+    np.testing.assert_allclose(bounds(interval), 100 * share, atol=1e-9)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 1.5])
@@ -39,7 +40,7 @@ def test_remaining_share_of_equal_runs_leaves_a_run_out_of_both_agents(share):
     removed = layout_blind + share * (agent - layout_blind)
     interval = remaining_share(layout_blind, agent, removed, CLUSTERS, same_runs=True)
     # Each run keeps an equal share of its lead, so the share does not depend on the run that is left out.
-    np.testing.assert_allclose((interval.mean, interval.low, interval.high), 100 * share, atol=1e-9)
+    np.testing.assert_allclose(bounds(interval), 100 * share, atol=1e-9)
     # With separate runs, numerator and denominator leave out runs with different leads.
     separate_interval = remaining_share(layout_blind, agent, removed, CLUSTERS)
     assert separate_interval.high - separate_interval.low > 1.0

@@ -10,10 +10,11 @@ import pytest
 from support import tiny_world as tiny
 from support.evaluation_steps import AGENT_LOOP, KNOWLEDGE, start_agent, take_step
 
-from jaxnav.evaluation.decision_share import ShareProbe, is_changed, share_interval
+from jaxnav.evaluation.decision_share import MIN_KL, ShareProbe, is_changed, share_interval
 from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.evaluation.grid import Evaluator, start_states
 from jaxnav.evaluation.replacements import DecisionContext, ReplacedPart, embed_decision_inputs, replace_part
+from jaxnav.evaluation.statistics import leave_one_out, mean_interval
 from jaxnav.evaluation.variants import Replacement, inference_grid, replacement_grid, table_row, table_rows
 from jaxnav.policies.features import Features
 from jaxnav.policies.methods.hoz import ZoneReading, ZoneRelations
@@ -71,35 +72,45 @@ def test_a_decision_changes_if_its_best_action_does_and_kl_exceeds_the_bound():
     def changed(probs, changed_probs):
         return bool(is_changed(jnp.log(jnp.array(probs)), jnp.log(jnp.array(changed_probs))))
 
-    # KL((0.6, 0.4) || (0.4, 0.6)) = 0.2 ln 1.5 = 0.081 is above the bound, and
-    # KL((0.51, 0.49) || (0.49, 0.51)) = 0.02 ln (0.51 / 0.49) = 0.0008 is below the bound.
-    assert math.isclose(0.2 * math.log(1.5), 0.0811, abs_tol=1e-4)
+    # The bound, 0.02 nats, lies between KL((0.51, 0.49) || (0.49, 0.51)) = 0.02 ln (0.51 / 0.49) = 0.0008 and
+    # KL((0.6, 0.4) || (0.4, 0.6)) = 0.2 ln 1.5 = 0.081.
+    assert 0.02 * math.log(0.51 / 0.49) < MIN_KL < 0.2 * math.log(1.5)
     assert changed((0.6, 0.4), (0.4, 0.6))
     assert not changed((0.51, 0.49), (0.49, 0.51))
     # The best action does not change, although KL is large.
     assert not changed((0.98, 0.02), (0.51, 0.49))
 
 
+def share_of(shares, part):
+    """Column of a part in an array whose last axis has all parts."""
+    return shares[..., PARTS.index(part)]
+
+
 @pytest.mark.slow
 def test_a_policy_that_ignores_experience_has_shares_of_zero(probe):
     counts, shares = probe(ignore_experience)
-    experience_parts = (ReplacedPart.OTHER_CATEGORIES, *PARTS[1:4])
+    experience_parts = (
+        ReplacedPart.OTHER_CATEGORIES,
+        ReplacedPart.EXPERIENCE,
+        ReplacedPart.PRIOR_WEIGHTS,
+        ReplacedPart.UNIFORM_WEIGHTS,
+    )
     for part in experience_parts:
-        assert (shares[:, part - 1] == 0).all()
+        assert (share_of(shares, part) == 0).all()
     assert counts.deleted.sum() == 0
-    assert counts.partner_differences[..., ReplacedPart.EXPERIENCE - 1].sum() == 0
+    assert share_of(counts.partner_differences, ReplacedPart.EXPERIENCE).sum() == 0
     # Negative control: the policy reads scene and goal.
-    assert (shares[:, ReplacedPart.SCENE_AND_GOAL - 1] > 0.05).all()
+    assert (share_of(shares, ReplacedPart.SCENE_AND_GOAL) > 0.05).all()
 
 
 @pytest.mark.slow
 def test_a_policy_of_experience_depends_on_no_direct_pathway(probe):
     _, shares = probe(use_only_experience)
-    assert (shares[:, ReplacedPart.SCENE_AND_GOAL - 1] == 0).all()
-    assert (shares[:, ReplacedPart.EXPERIENCE - 1] > 0.1).all()
-    assert (shares[:, ReplacedPart.OTHER_CATEGORIES - 1] > 0.05).all()
+    assert (share_of(shares, ReplacedPart.SCENE_AND_GOAL) == 0).all()
+    assert (share_of(shares, ReplacedPart.EXPERIENCE) > 0.1).all()
+    assert (share_of(shares, ReplacedPart.OTHER_CATEGORIES) > 0.05).all()
     # The baseline has no layout weights w to replace.
-    assert shares[0, ReplacedPart.UNIFORM_WEIGHTS - 1] == 0
+    assert share_of(shares, ReplacedPart.UNIFORM_WEIGHTS)[ARMS.index("baseline")] == 0
 
 
 def replaced_and_factual_inputs(agent, partner, part, layout_weights=None):
@@ -202,6 +213,16 @@ def test_share_interval_pools_decisions():
     assert single_run_share.mean == pytest.approx(10.0)
     assert not single_run_share.has_bounds
     assert math.isnan(share_interval(num_changed, 0 * num_decisions, clusters).mean)
+
+
+def test_share_of_fixed_policies_has_an_interval_over_scenes_alone():
+    # One policy in 8 scenes of 3 episodes, with ten probed decisions in each: the share is the mean of their shares.
+    scenes = leave_one_out(np.repeat(np.arange(8), 3))
+    num_changed = np.random.default_rng(0).integers(0, 10, (1, 24))
+    share = share_interval(num_changed, np.full_like(num_changed, 10), scenes, trained=False)
+    assert share.has_bounds
+    expected = mean_interval(10.0 * num_changed, scenes, trained=False)
+    np.testing.assert_allclose((share.mean, share.low, share.high), (expected.mean, expected.low, expected.high))
 
 
 # Replacement of other categories by the methods

@@ -4,6 +4,7 @@ import json
 import math
 
 import pytest
+from support.intervals import bounds
 
 from jaxnav.evaluation.statistics import Interval
 
@@ -12,7 +13,7 @@ UNDEFINED = Interval(NAN)
 
 
 def interval_fields(interval: Interval) -> list[float]:
-    return [interval.mean, interval.low, interval.high, interval.std, *interval.seeds]
+    return [*bounds(interval), interval.std, *interval.seeds]
 
 
 @pytest.mark.parametrize(

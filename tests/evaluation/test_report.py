@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 from support.episodes import episodes_in
-from support.intervals import around
+from support.intervals import student_interval
 
 from jaxnav.errors import InputError
 from jaxnav.evaluation import report as reports
@@ -41,7 +41,7 @@ def episodes_with_lengths(*lengths):
 
 
 def bounds_around(mean, variance, degrees):
-    return pytest.approx([*around(mean, variance, degrees)[1:]])
+    return pytest.approx([*student_interval(mean, variance, degrees)[1:]])
 
 
 def test_row_has_all_keys_of_the_format():

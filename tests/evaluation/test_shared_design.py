@@ -1,4 +1,4 @@
-"""What conditions share: scenes, floor plans, training runs."""
+"""Intervals over conditions that share scenes, floor plans and training runs."""
 
 from collections.abc import Sequence
 
@@ -7,18 +7,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from support.intervals import around, bounds, left_out
+from support.intervals import bounds, student_interval, two_way_jackknife_interval
 
 from jaxnav.evaluation.statistics import Interval, SharedDesign
 
-SEEDS, SCENES, EPISODES = 3, 5, 4
-NAMES, OTHERS = tuple("abcde"), tuple("vwxyz")
-KITCHENS = ("kitchen",) * SCENES
-EQUAL = np.full(SCENES, EPISODES)
-MEANS = arrays(float, (SEEDS, SCENES), elements=st.integers(-20, 20).map(float))
+NUM_SEEDS = 3
+NUM_SCENES = 5
+NUM_EPISODES = 4  # of each scene
+NAMES = tuple("abcde")
+OTHER_NAMES = tuple("vwxyz")
+KITCHENS = ("kitchen",) * NUM_SCENES
+EQUAL_WEIGHTS = np.full(NUM_SCENES, NUM_EPISODES)
+MEANS = arrays(float, (NUM_SEEDS, NUM_SCENES), elements=st.integers(-20, 20).map(float))
 
 
-def mean_interval_of(means: np.ndarray, weights=EQUAL, names: Sequence[str] = NAMES, rooms: Sequence[str] = KITCHENS):
+def mean_interval_of(
+    means: np.ndarray, weights=EQUAL_WEIGHTS, names: Sequence[str] = NAMES, rooms: Sequence[str] = KITCHENS
+):
     """Return the interval of one condition, from means by scene."""
     design = SharedDesign.from_conditions([(names, rooms)], len(means))
     return design.interval(design.jackknife_means(means * weights, np.array(weights), names))
@@ -26,9 +31,9 @@ def mean_interval_of(means: np.ndarray, weights=EQUAL, names: Sequence[str] = NA
 
 def growth_interval(first_means: np.ndarray, last_means: np.ndarray, names: Sequence[str] = NAMES) -> Interval:
     """Return how much the mean grows; `names` are those at the end."""
-    design = SharedDesign.from_conditions([(NAMES, KITCHENS), (names, KITCHENS)], SEEDS)
-    first_replicates = design.jackknife_means(EPISODES * first_means, EQUAL, NAMES)
-    last_replicates = design.jackknife_means(EPISODES * last_means, EQUAL, names)
+    design = SharedDesign.from_conditions([(NAMES, KITCHENS), (names, KITCHENS)], NUM_SEEDS)
+    first_replicates = design.jackknife_means(NUM_EPISODES * first_means, EQUAL_WEIGHTS, NAMES)
+    last_replicates = design.jackknife_means(NUM_EPISODES * last_means, EQUAL_WEIGHTS, names)
     return design.interval(last_replicates - first_replicates)
 
 
@@ -40,18 +45,18 @@ def test_balanced_mean_interval_is_the_analysis_of_variance(means):
     by_run = means.mean(axis=1)
     overall_mean = means.mean()
     residuals = means - by_scene - by_run[:, None] + overall_mean
-    degrees = np.array([SCENES - 1, SEEDS - 1, (SCENES - 1) * (SEEDS - 1)])
+    degrees = np.array([NUM_SCENES - 1, NUM_SEEDS - 1, (NUM_SCENES - 1) * (NUM_SEEDS - 1)])
     squares = (
-        SEEDS * ((by_scene - overall_mean) ** 2).sum(),
-        SCENES * ((by_run - overall_mean) ** 2).sum(),
+        NUM_SEEDS * ((by_scene - overall_mean) ** 2).sum(),
+        NUM_SCENES * ((by_run - overall_mean) ** 2).sum(),
         (residuals**2).sum(),
     )
-    mean_squares = squares / degrees / (SEEDS * SCENES)
+    mean_squares = squares / degrees / (NUM_SEEDS * NUM_SCENES)
     variance = max(mean_squares[0] + mean_squares[1] - mean_squares[2], mean_squares[0], mean_squares[1])
     squared_spread = (mean_squares**2 / degrees).sum()
     satterthwaite_degrees = np.clip(variance**2 / squared_spread, 2, 4 + 2) if squared_spread > 1e-18 else 4 + 2
     assert bounds(mean_interval_of(means)) == pytest.approx(
-        around(overall_mean, variance, satterthwaite_degrees), abs=1e-6
+        student_interval(overall_mean, variance, satterthwaite_degrees), abs=1e-6
     )
 
 
@@ -63,53 +68,58 @@ def test_growth_over_shared_scenes_is_the_interval_of_differences(first_means, l
 
 
 def test_growth_over_shared_scenes_has_a_narrower_interval():
-    # Scenes of unlike difficulty, all of which gain 2 points or 4, alike in all runs.
-    first_means = np.tile([10.0, 20, 30, 40, 50], (SEEDS, 1))
+    # Scenes with means from 10 to 50 gain 2, 4, 2, 4 and 3 points, equally in all runs.
+    first_means = np.tile([10.0, 20, 30, 40, 50], (NUM_SEEDS, 1))
     last_means = first_means + np.array([2.0, 4, 2, 4, 3])
     shared_growth = growth_interval(first_means, last_means)
-    separate_growth = growth_interval(first_means, last_means, OTHERS)
+    separate_growth = growth_interval(first_means, last_means, OTHER_NAMES)
     assert shared_growth.mean == separate_growth.mean == pytest.approx(3.0)
     # Gains have squares 1 + 1 + 1 + 1 + 0: variance 4 / 4 of one, / 5 of the mean.
-    assert bounds(shared_growth) == pytest.approx(around(3, 1 / 5, 4))
-    # Apart, ten scenes are left out, each of one mean of five, which moves by (x - mean) / 4. Squares about the
-    # means 30 and 33: 400 + 100 + 0 + 100 + 400 = 1000 and 441 + 81 + 1 + 121 + 400 = 1044, 9 / 10 of which count.
-    assert bounds(separate_growth) == pytest.approx(around(3, 0.9 * 2044 / 16, 9))
+    assert bounds(shared_growth) == pytest.approx(student_interval(3, 1 / 5, 4))
+    # With separate scenes, the jackknife leaves out ten scenes. Without a scene of mean x, the mean of its five scenes
+    # changes by (x - mean) / 4. Squares about the means 30 and 33: 400 + 100 + 0 + 100 + 400 = 1000 and
+    # 441 + 81 + 1 + 121 + 400 = 1044, with the jackknife's factor 9 / 10.
+    assert bounds(separate_growth) == pytest.approx(student_interval(3, 0.9 * 2044 / 16, 9))
     assert shared_growth.low > 0 > separate_growth.low
 
 
 def test_growth_matches_scenes_by_name_not_by_order():
     generator = np.random.default_rng(0)
-    first_means, last_means = generator.random((2, SEEDS, SCENES))
+    first_means, last_means = generator.random((2, NUM_SEEDS, NUM_SCENES))
     order = [3, 0, 4, 1, 2]
     shuffled_growth = growth_interval(first_means, last_means[:, order], [NAMES[index] for index in order])
     assert bounds(shuffled_growth) == pytest.approx(bounds(growth_interval(first_means, last_means)))
 
 
 def test_growth_leaves_a_run_out_of_all_conditions():
-    # Runs are unlike, by as much at both shifts: their growth is equal. With their order changed it is not.
-    first_means = np.arange(SCENES) + 10.0 * np.arange(SEEDS)[:, None]
+    # Runs differ by 10 points, equally at both shifts, so every run grows by 1. If the runs of the last shift are
+    # reversed, growth differs between runs.
+    first_means = np.arange(NUM_SCENES) + 10.0 * np.arange(NUM_SEEDS)[:, None]
     assert bounds(growth_interval(first_means, first_means + 1.0)) == pytest.approx((1.0, 1.0, 1.0))
     assert growth_interval(first_means, first_means[::-1] + 1.0).low < 0
 
 
 def test_scenes_are_weighted_by_their_episodes():
-    generator, weights = np.random.default_rng(1), np.array([1.0, 5, 2, 3, 9])
-    means = generator.random((SEEDS, SCENES))
+    generator = np.random.default_rng(1)
+    weights = np.array([1.0, 5, 2, 3, 9])
+    means = generator.random((NUM_SEEDS, NUM_SCENES))
 
     def mean(scene: int | None, run: int | None) -> float:
-        has_scene = np.arange(SCENES) != scene
-        has_run = np.arange(SEEDS) != run
+        has_scene = np.arange(NUM_SCENES) != scene
+        has_run = np.arange(NUM_SEEDS) != run
         return float(np.average(means[has_run].mean(axis=0)[has_scene], weights=weights[has_scene]))
 
-    assert bounds(mean_interval_of(means, weights)) == pytest.approx(left_out(mean, SCENES, SEEDS))
+    assert bounds(mean_interval_of(means, weights)) == pytest.approx(
+        two_way_jackknife_interval(mean, NUM_SCENES, NUM_SEEDS)
+    )
 
 
 def test_room_types_are_strata_of_the_mean():
     # Kitchens are at 0 and 10, bedrooms at 70, 80 and 90, alike in all runs: variance 50 of a kitchen and 100 of a
     # bedroom, so (2 / 5)^2 50 / 2 + (3 / 5)^2 100 / 3 = 16 of the mean.
-    means = np.tile([0.0, 10, 70, 80, 90], (SEEDS, 1))
+    means = np.tile([0.0, 10, 70, 80, 90], (NUM_SEEDS, 1))
     result = mean_interval_of(means, rooms=("kitchen", "kitchen", "bedroom", "bedroom", "bedroom"))
-    assert bounds(result) == pytest.approx(around(50, 16, 1 + 2))
+    assert bounds(result) == pytest.approx(student_interval(50, 16, 1 + 2))
     # One stratum is wider: the types differ.
     assert mean_interval_of(means).low < result.low - 10
     # An only kitchen shows no variance of kitchens: all are one stratum.
@@ -121,28 +131,29 @@ def test_room_types_are_strata_of_the_mean():
 def test_scenes_of_a_floor_plan_are_one_cluster():
     # Plan 0 is at 10, 20 and 30, plan 1 at 50 twice, plan 2 at 80, by equally many episodes: those of plans.
     names = [f"val-apartment-{plan:02}-{i}" for plan, i in ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (2, 0))]
-    means = np.tile([10.0, 20, 30, 50, 50, 80], (SEEDS, 1))
-    result = mean_interval_of(means, np.full(6, EPISODES), names, ("apartment",) * 6)
+    means = np.tile([10.0, 20, 30, 50, 50, 80], (NUM_SEEDS, 1))
+    result = mean_interval_of(means, np.full(6, NUM_EPISODES), names, ("apartment",) * 6)
     # Mean 40; without plan 0 it is 60, without 1 35, without 2 32: 2 / 3 of the squares 400 + 25 + 64.
-    assert bounds(result) == pytest.approx(around(40, 2 / 3 * 489, 2))
+    assert bounds(result) == pytest.approx(student_interval(40, 2 / 3 * 489, 2))
 
 
 def test_untrained_means_vary_with_scenes_alone():
     means = np.array([[10.0, 20, 30, 40, 50]])
-    design = SharedDesign.from_conditions([(NAMES, KITCHENS)], SEEDS)
-    replicates = design.jackknife_means(means * EQUAL, EQUAL, NAMES, trained=False)
+    design = SharedDesign.from_conditions([(NAMES, KITCHENS)], NUM_SEEDS)
+    replicates = design.jackknife_means(means * EQUAL_WEIGHTS, EQUAL_WEIGHTS, NAMES, trained=False)
     np.testing.assert_allclose(replicates, [30, 35, 32.5, 30, 27.5, 25])  # without each scene in turn
-    assert bounds(design.interval(replicates)) == pytest.approx(around(30, 250 / 5, SCENES - 1))
+    assert bounds(design.interval(replicates)) == pytest.approx(student_interval(30, 250 / 5, NUM_SCENES - 1))
 
 
 def test_scenes_without_episodes_are_ignored():
-    means, rooms = np.tile([50.0, 50, 7, 90, 90], (SEEDS, 1)), ("kitchen",) * 3 + ("bedroom",) * 2
-    # Each room type is at one level, so scenes of these types tell nothing apart; the third was not drawn.
+    means = np.tile([50.0, 50, 7, 90, 90], (NUM_SEEDS, 1))
+    rooms = ("kitchen",) * 3 + ("bedroom",) * 2
+    # Scenes within a room type are equal, so the interval has no width; scene 2 has no episodes.
     result = mean_interval_of(means, np.array([4, 4, 0, 4, 4]), rooms=rooms)
     assert bounds(result) == pytest.approx((70.0, 70.0, 70.0))
 
 
 def test_mean_of_a_single_scene_has_no_bounds():
-    result = mean_interval_of(np.ones((SEEDS, SCENES)), np.array([4, 0, 0, 0, 0]))
+    result = mean_interval_of(np.ones((NUM_SEEDS, NUM_SCENES)), np.array([4, 0, 0, 0, 0]))
     assert result.mean == 1.0
     assert not result.has_bounds

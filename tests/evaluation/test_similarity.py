@@ -47,8 +47,8 @@ def test_expected_cooccurrence_normalizes_rows_without_the_diagonal():
 
 def test_scene_gap_and_similarity_follow_worked_arithmetic():
     # Two others per row, so 0.05 of uniform is 0.025 each. Row 0 of the scene: w = (1/4, 3/4), p = 0.95 w + 0.025 =
-    # (0.2625, 0.7375); of the prior: w = (1/2, 1/2), q = (0.5, 0.5). Row 2: p = (0.975, 0.025) for category 0 and 1,
-    # and the prior's row is empty, so that q is 0.025 each. Row 1 of the scene is empty and left out.
+    # (0.2625, 0.7375); of the prior: w = (1/2, 1/2), q = (0.5, 0.5). Row 2: w = (1, 0), p = (0.975, 0.025); the prior's
+    # row (1, 1) has w = (1/2, 1/2), so q = (0.5, 0.5). Row 1 of the scene is empty and left out.
     counts = np.array([[[9, 1, 3], [0, 5, 0], [2, 0, 0]]])
     prior = np.array([[0, 7, 7], [1, 0, 1], [1, 1, 0]])
     row_0 = 0.2625 * math.log(0.2625 / 0.5) + 0.7375 * math.log(0.7375 / 0.5)

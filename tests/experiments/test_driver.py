@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 from support.commands import contents
-from support.processes import run as start_python
+from support.processes import start_python
 from support.tiny_run import CONFIG_YAML
 
 import jaxnav

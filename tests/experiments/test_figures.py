@@ -10,6 +10,7 @@ from matplotlib.collections import FillBetweenPolyCollection, LineCollection, Pa
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from PIL import Image
+from support.result_rows import make_curve, make_seeded_interval
 
 from jaxnav.choices import Form
 from jaxnav.evaluation.statistics import Interval
@@ -25,37 +26,27 @@ SHIFTS = (0.0, 1.0)
 METRICS = ("sr", "spl", "dts")
 
 
-def make_interval(mean: float, half_width: float = 1.0) -> Interval:
-    """Interval with three seeds at a distance of 1."""
-    return Interval(mean, mean - half_width, mean + half_width, 1.0, (mean - 1.0, mean, mean + 1.0))
-
-
-def make_curve(*mean: float) -> Curve:
-    means = np.array(mean)
-    return Curve(np.arange(len(means), dtype=float), means, means - 0.05, means + 0.05)
-
-
 SUCCESS = {}
 for _shift in SHIFTS:
     SUCCESS[_shift] = SuccessBySimilarity(
         episodes=np.array([4, 8, 2, 4]),
         similarity=np.array([0.9, 0.1, 0.5, 0.3]),
         success=np.array([1.0, 0.25, 0.5, 0.75]),
-        pearson=make_interval(0.5, 0.1),
-        spearman=make_interval(-0.25, 0.5),
+        pearson=make_seeded_interval(0.5, 0.1),
+        spearman=make_seeded_interval(-0.25, 0.5),
     )
 GAIN = GainBySimilarity(
     categories=("Sink", "Book", "Pan"),
     similarity=np.array([0.8, 0.4, 0.6]),
     baseline=np.array([70.0, 40.0, 50.0]),
     gain=np.array([-2.0, 6.0, 1.0]),
-    slope=make_interval(-2.0, 0.5),
-    pearson=make_interval(-0.75, 0.25),
+    slope=make_seeded_interval(-2.0, 0.5),
+    pearson=make_seeded_interval(-0.75, 0.25),
 )
 
 
 def make_metrics(sr: float, spl: float, dts: float) -> dict[str, Interval]:
-    return {"sr": make_interval(sr), "spl": make_interval(spl), "dts": make_interval(dts)}
+    return {"sr": make_seeded_interval(sr), "spl": make_seeded_interval(spl), "dts": make_seeded_interval(dts)}
 
 
 SWEEPS: dict[tuple[float, Form], dict[float, dict[str, Interval]]] = {}
@@ -69,14 +60,17 @@ for _form in FORMS:
 GAP_LINES: dict[tuple[float, Belief], Curve] = {}
 for _shift in SHIFTS:
     for _belief in BELIEFS:
-        GAP_LINES[_shift, _belief] = make_curve(0.7, 0.5 + 0.1 * _shift, 0.4, 0.3)
+        GAP_LINES[_shift, _belief] = make_curve(0.7, 0.5 + 0.1 * _shift, 0.4, 0.3, half_width=0.05)
 GAPS: dict[str, dict[tuple[float, Belief], Curve]] = {}
 for _setting in ("paper", "released", "calibrated"):
     GAPS[_setting] = GAP_LINES
-AUCS = {"calibrated": make_curve(0.5, 0.6, 0.7, 0.7), "evidence": make_curve(0.6, 0.7, 0.8, 0.8)}
+AUCS = {
+    "calibrated": make_curve(0.5, 0.6, 0.7, 0.7, half_width=0.05),
+    "evidence": make_curve(0.6, 0.7, 0.8, 0.8, half_width=0.05),
+}
 EFFECTS = {
-    "shift 0": {"+ w": make_interval(3.0), "sTDE": make_interval(-1.0, 2.0)},
-    "shift 1": {"+ w": make_interval(-4.0, 1.5)},
+    "shift 0": {"+ w": make_seeded_interval(3.0), "sTDE": make_seeded_interval(-1.0, 2.0)},
+    "shift 1": {"+ w": make_seeded_interval(-4.0, 1.5)},
 }
 DRAWINGS: dict[str, Callable[[], Figure]] = {
     "similarity": lambda: figures.similarity_figure(SUCCESS),
@@ -186,7 +180,7 @@ def test_the_auc_figure_has_a_line_by_estimator():
 
 
 def test_more_lines_than_styles_are_distinguishable():
-    curve_by_estimator = {f"estimator {index}": make_curve(0.5, 0.6, 0.7) for index in range(9)}
+    curve_by_estimator = {f"estimator {index}": make_curve(0.5, 0.6, 0.7, half_width=0.05) for index in range(9)}
     (axes,) = figures.auc_figure(curve_by_estimator).axes
     lines = [line for line in axes.get_lines() if line.get_marker() != "None"]
     line_styles = {(line.get_color(), line.get_marker(), line.get_markerfacecolor()) for line in lines}
@@ -280,7 +274,7 @@ def test_the_similarity_figures_are_drawn_from_rows_by_point_and_category():
             rows.append({**baseline, "metric": f"{metric} by similarity", "value": curve})
         for index, category in enumerate(GAIN.categories):
             for metric in ("similarity", "baseline", "gain"):
-                value = make_interval(float(getattr(GAIN, metric)[index]) + shift)
+                value = make_seeded_interval(float(getattr(GAIN, metric)[index]) + shift)
                 category_fields = {"shift": shift, "category": category, "metric": f"{metric} by category"}
                 rows.append({**stde, **category_fields, "value": value})
     table = make_table(*rows)
@@ -308,7 +302,7 @@ def test_the_epsilon_figure_is_drawn_from_sweeps_with_best_actions():
                 # The figure ignores sampled actions, controls, further gaps and differences.
                 for change in ({"decoding": "sample"}, {"control": "noise"}, {"gap": "clock"}, {"reference": "layout"}):
                     other_row = {**sweep, "decoding": "argmax", "metric": metric, **change}
-                    rows.append({**other_row, "value": make_interval(7.0), "epsilon": 0.25})
+                    rows.append({**other_row, "value": make_seeded_interval(7.0), "epsilon": 0.25})
     figure = figures.FIGURES["fig6a"](make_table(*rows), SHIFTS, FIELDS)
     for axes, expected_axes in zip(figure.axes, DRAWINGS["epsilon"]().axes, strict=True):
         np.testing.assert_allclose(marked_lines(axes), marked_lines(expected_axes))
@@ -317,7 +311,7 @@ def test_the_epsilon_figure_is_drawn_from_sweeps_with_best_actions():
 @pytest.mark.slow
 def test_the_gap_figures_are_drawn_from_curves_of_the_outer_shifts():
     shifts = (0.0, 0.5, 1.0)
-    ignored_curve = make_curve(9, 9, 9, 9)
+    ignored_curve = make_curve(9, 9, 9, 9, half_width=0.05)
     rows = []
     for shift in shifts:
         for setting in GAPS:
@@ -345,7 +339,7 @@ def test_the_effects_figure_is_drawn_from_differences_to_the_layout():
         for (form, epsilon, gap), effect in effects.items():
             stde = {"variant": "stde", "decoding": "argmax", "form": form, "epsilon": epsilon, "gap": gap}
             difference = {"shift": shift, "reference": "layout", "metric": "sr"}
-            rows.append({**stde, **difference, "value": make_interval(effect + 10 * shift)})
+            rows.append({**stde, **difference, "value": make_seeded_interval(effect + 10 * shift)})
     figure = figures.FIGURES["effects"](make_table(*rows), SHIFTS, FIELDS)
     for axes, shift in zip(figure.axes, SHIFTS, strict=True):
         drawn_effects = [float(points[0, 0]) for points in marked_lines(axes)]

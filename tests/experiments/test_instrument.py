@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 from rich.console import Console
-from support.intervals import around, bounds
+from support.intervals import bounds, student_interval
 from support.scenes import draw
 
 from jaxnav.errors import InputError
@@ -14,7 +14,8 @@ from jaxnav.evaluation.episodes import join_episode_lists
 from jaxnav.evaluation.grid import EpisodeOutcome
 from jaxnav.evaluation.statistics import Interval
 from jaxnav.experiments import instrument
-from jaxnav.experiments.config import ExperimentConfig
+from jaxnav.experiments.bench import Bench
+from jaxnav.experiments.config import AgentRun, ExperimentConfig
 from jaxnav.experiments.instrument import (
     BASELINE_MEASURES,
     CATEGORY_MEASURES,
@@ -23,10 +24,12 @@ from jaxnav.experiments.instrument import (
     SceneTotals,
     compare_shifts,
     measure_detection,
+    measure_instrument,
     measure_scenes,
 )
 from jaxnav.experiments.pages import render_page
 from jaxnav.experiments.table import ResultTable
+from jaxnav.runs.config import RunConfig
 from jaxnav.runs.policies import load_policies
 from jaxnav.runs.worlds import compile_evaluation_world, draw_episode_lists
 from jaxnav.scenes.tables.compile import categories_in_view, compile_bank, compile_scene
@@ -133,8 +136,12 @@ def test_means_and_changes_equal_values_worked_out_by_hand():
 
     # L* is 60 / 3 and 63 / 3. The sample variances of three scenes are 100 and (9^2 + 1 + 10^2) / 2 = 91; those of the
     # means are a third.
-    assert bounds(table.find(FIELDS, shift=0.0, metric="best_length")) == pytest.approx(around(20.0, 100 / 3, 2))
-    assert bounds(table.find(FIELDS, shift=1.0, metric="best_length")) == pytest.approx(around(21.0, 91 / 3, 2))
+    assert bounds(table.find(FIELDS, shift=0.0, metric="best_length")) == pytest.approx(
+        student_interval(20.0, 100 / 3, 2)
+    )
+    assert bounds(table.find(FIELDS, shift=1.0, metric="best_length")) == pytest.approx(
+        student_interval(21.0, 91 / 3, 2)
+    )
     assert table.num_scenes(shift=0.0, metric="best_length") == 3
     assert table.find(FIELDS, shift=1.0, metric="episodes").mean == 6.0
 
@@ -147,7 +154,7 @@ def test_means_and_changes_equal_values_worked_out_by_hand():
     # by run, and 0 by their interaction. Degrees of freedom: (400 / 3 + 100)^2 / ((400 / 3)^2 / 2 + 100^2 / 1) = 2.88.
     success = table.find(FIELDS, shift=0.0, metric="baseline_argmax_sr")
     degrees = (700 / 3) ** 2 / ((400 / 3) ** 2 / 2 + 100**2)
-    assert bounds(success) == pytest.approx(around(50.0, 700 / 3, degrees))
+    assert bounds(success) == pytest.approx(student_interval(50.0, 700 / 3, degrees))
 
     # All scenes and seeds lose 10 points, so the interval has no width.
     assert bounds(find_change(table, "baseline_argmax_sr")) == pytest.approx((10.0, 10.0, 10.0))
@@ -226,6 +233,14 @@ def test_more_wrong_dones_are_a_loss():
 def test_a_difficulty_of_zero_has_no_change_in_percent():
     with pytest.raises(InputError, match=r"frontier_sr.* shift 0.*--episodes"):
         compare(make_totals(frontier_sr=[0, 0, 0]), make_totals())
+
+
+def test_a_run_without_the_baseline_is_refused_before_it_trains(tmp_path):
+    run_config = RunConfig(run_dir=tmp_path / "run", arms=("layout",))
+    bench = Bench(ExperimentConfig(), Console(quiet=True))
+    with pytest.raises(InputError, match="has no arm `baseline`, which `instrument` measures"):
+        list(measure_instrument(bench, AgentRun("rooms", "org", run_config)))
+    assert not run_config.run_dir.exists()
 
 
 # Verdicts of the page

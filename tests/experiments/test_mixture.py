@@ -209,7 +209,9 @@ def mixture_table(drawn_run, tmp_path_factory) -> ResultTable:
     surprise_rules = [rule for rule in REMOVAL_RULES if rule.gap == "surprise"]
     assert surprise_rules
     requested_rules = (*surprise_rules, *MEASURED_RULES)
-    return ResultTable(measure_removals(bench, bench.find_run("rooms", "main"), "sample", "own", requested_rules))
+    agent_run = bench.find_run("rooms", "main")
+    assert agent_run is not None
+    return ResultTable(measure_removals(bench, agent_run, "sample", "own", requested_rules))
 
 
 def list_removals(table: ResultTable) -> list[str]:

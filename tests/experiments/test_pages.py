@@ -3,11 +3,12 @@
 import math
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from support.intervals import bounds
 from support.processes import REPOSITORY
+from support.result_rows import make_interval, make_row
 
 from jaxnav.cli.study import parse_study
 from jaxnav.errors import InputError
@@ -32,16 +33,6 @@ from jaxnav.experiments.table import Curve, ResultRow, ResultTable
 
 AGENTS = {"main": {}, "anonymous": {"method": "anonymous", "arms": ["baseline"]}}
 CONFIG = ExperimentConfig(title="A title", agents=AGENTS)
-
-
-def make_row(value: Interval | Curve | float = 50.0, **fields: Any) -> ResultRow:
-    """Row of the main agent in rooms."""
-    row_value = value if isinstance(value, Interval | Curve) else Interval(value)
-    return ResultRow(**{"world": "rooms", "run": "main", "metric": "sr", **fields}, value=row_value)
-
-
-def make_interval(mean: float, half_width: float = 1.0) -> Interval:
-    return Interval(mean, mean - half_width, mean + half_width)
 
 
 def render(folder: Path, template: str, *rows: ResultRow, config: ExperimentConfig = CONFIG) -> str:
@@ -70,27 +61,24 @@ def read_lines(text: str) -> dict[str, list[str]]:
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "expected"),
+    ("effect", "expected"),
     [
-        (0.5, 3.0, "holds"),
-        (2.5, 3.0, "holds"),
-        (0.5, 1.5, "excluded"),  # positive, but too small
-        (-1.0, 1.5, "excluded"),
-        (-4.0, -1.0, "refuted"),
-        (-4.0, 0.0, "excluded"),  # 0 is within the interval
-        (-1.0, 2.5, "inconclusive"),
-        (0.0, 2.5, "inconclusive"),
-        (-1.0, 2.0, "inconclusive"),  # the least effect is within the interval, too
-        (math.nan, math.nan, "inconclusive"),
+        # The verdict depends on the bounds alone; the mean is deliberately outside them.
+        (Interval(5.0, 0.5, 3.0), "holds"),
+        (Interval(5.0, 2.5, 3.0), "holds"),
+        (Interval(5.0, 0.5, 1.5), "excluded"),  # positive, but too small
+        (Interval(5.0, -1.0, 1.5), "excluded"),
+        (Interval(5.0, -4.0, -1.0), "refuted"),
+        (Interval(5.0, -4.0, 0.0), "excluded"),  # 0 is within the interval
+        (Interval(5.0, -1.0, 2.5), "inconclusive"),
+        (Interval(5.0, 0.0, 2.5), "inconclusive"),
+        (Interval(5.0, -1.0, 2.0), "inconclusive"),  # the least effect is within the interval, too
+        (Interval(5.0), "inconclusive"),  # no bounds
+        (Interval(math.nan), "not measured"),
     ],
 )
-def test_a_verdict_compares_the_interval_with_zero_and_the_least_effect(low, high, expected):
-    assert verdict(Interval(5.0, low, high), min_effect=2.0) == expected
-
-
-def test_an_undefined_effect_has_no_decisive_verdict():
-    undefined_verdict = verdict(Interval(math.nan), min_effect=2.0)
-    assert undefined_verdict not in ("holds", "refuted", "excluded")
+def test_a_verdict_compares_the_interval_with_zero_and_the_least_effect(effect, expected):
+    assert verdict(effect, min_effect=2.0) == expected
 
 
 def test_undefined_values_are_dashes():
@@ -120,7 +108,7 @@ def test_lines_have_a_cell_for_each_column():
 def test_a_difference_of_worlds_adds_both_widths():
     # 10 [8, 12] and 5 [4, 7]: 8 - 7 = 1 and 12 - 4 = 8.
     difference = difference_of_worlds(Interval(10.0, 8.0, 12.0), Interval(5.0, 4.0, 7.0))
-    assert (difference.mean, difference.low, difference.high) == (5.0, 1.0, 8.0)
+    assert bounds(difference) == (5.0, 1.0, 8.0)
 
 
 # Documents
@@ -363,7 +351,7 @@ def test_a_claim_without_results_has_the_verdict_of_no_effect(tmp_path):
     text = render(tmp_path, "study", *rows)
     for words in ("grows with the shift", "Hard TDE loses"):
         effect, _, claim_verdict = find_claim(text, words)
-        assert (effect, claim_verdict) == ("-", verdict(Interval(math.nan), 2.0))
+        assert (effect, claim_verdict) == ("-", "not measured")
 
 
 def test_the_gap_is_shown_at_the_steps_that_episodes_reach(study_page):
@@ -504,7 +492,9 @@ def make_effect(world: str, run: str, variant: str, reference: str, effect: Inte
     return make_row(effect, world=world, run=run, metric=metric, **fields)
 
 
-def test_orderings_are_judged_by_their_intervals(tmp_path):
+@pytest.fixture(scope="module")
+def ordering_cells(tmp_path_factory) -> dict[str, list[str]]:
+    """Cells of the orderings of three agents in rooms, by the name of the ordering."""
     rows = [
         *make_agent_rows("rooms", "rgb", baseline=60.0),
         *make_agent_rows("rooms", "org", baseline=80.0),
@@ -516,10 +506,13 @@ def test_orderings_are_judged_by_their_intervals(tmp_path):
         make_effect("rooms", "org", "tde", "layout", make_interval(5.0)),
         make_effect("rooms", "hoz", "layout", "baseline", make_interval(1.0, 3.0)),
     ]
-    cells = read_lines(render_paper(tmp_path, *rows))
+    return read_lines(render_paper(tmp_path_factory.mktemp("orderings"), *rows))
 
+
+def test_orderings_are_judged_by_their_intervals(ordering_cells):
     # The paper's means are over the methods that were run: (66.53 + 70.38) / 2 - 59.06 = 9.395, and
     # (59.06 + 66.53 + 70.38) / 3 - 4.68 = 60.643.
+    cells = ordering_cells
     assert cells["rooms: structured methods over `rgb` (2 of 6)"] == ["+9.4", "+20.0 [+19.0, +21.0]", "-", "holds"]
     assert cells["rooms: methods over Random (3 of 8)"] == ["+60.6", "+68.0 [+67.0, +69.0]", "-", "holds"]
 
@@ -529,7 +522,8 @@ def test_orderings_are_judged_by_their_intervals(tmp_path):
     assert cells["rooms: `org` + w over `org` + w + TDE"] == ["+2.2", "-5.0 [-6.0, -4.0]", "-", "refuted"]
     assert cells["rooms: `hoz` + w over `hoz`"][1:] == ["+1.0 [-2.0, +4.0]", "-", "inconclusive"]
 
-    # Effects on SPL have a column, too.
+
+def test_orderings_have_a_column_of_effects_on_spl(tmp_path):
     changes = {"sr": -5.0, "spl": -3.0}
     spl_rows = []
     for metric, mean in changes.items():
@@ -537,9 +531,11 @@ def test_orderings_are_judged_by_their_intervals(tmp_path):
     spl_cells = read_lines(render_paper(tmp_path, *make_agent_rows("rooms", "org", baseline=80.0), *spl_rows))
     assert spl_cells["rooms: `org` + w over `org` + w + TDE"][2] == "+3.0 [+2.0, +4.0]"
 
-    # Orderings without results have no verdict.
-    assert cells["rooms: `eotp` + w over `eotp`"][1:] == ["-", "-", "not run"]
-    assert cells["apartments: all"][-1] == cells["gains of hosts: apartments over rooms"][-1] == "not run"
+
+def test_orderings_without_results_have_no_verdict(ordering_cells):
+    assert ordering_cells["rooms: `eotp` + w over `eotp`"][1:] == ["-", "-", "not run"]
+    for name in ("apartments: all", "gains of hosts: apartments over rooms"):
+        assert ordering_cells[name][-1] == "not run"
 
 
 def make_share(run: str, variant: str, share: float) -> ResultRow:
@@ -559,7 +555,9 @@ def test_hosts_with_idle_experience_have_no_verdict(tmp_path):
     assert "experience is idle" in idle_cells[-1]
 
 
-def test_orderings_on_the_test_split_stand_next_to_those_on_val(tmp_path):
+@pytest.fixture(scope="module")
+def split_tables() -> dict[str, ResultTable]:
+    """Results of both splits."""
     # On `val` w gains 5 points and hard TDE loses 4; on `test` w loses 3 and hard TDE 2. HOZ has no results on `test`.
     shares = [make_share("org", "layout", 20.0), make_share("hoz", "layout", 20.0)]
     val_rows = [
@@ -573,10 +571,18 @@ def test_orderings_on_the_test_split_stand_next_to_those_on_val(tmp_path):
         make_effect("rooms", "org", "layout", "baseline", make_interval(-3.0)),
         make_effect("rooms", "org", "tde", "layout", make_interval(-2.0)),
     ]
-    tables = {"val": ResultTable(val_rows + shares), "test": ResultTable(test_rows)}
-    text = render_page(tmp_path / "page.md", "paper", parse_study(["table2"]), tables, [])
-    orderings, rest = text.split("### On the split `test`, evaluated once")
-    test_section, paper_tables = rest.split("## The three tables")
+    return {"val": ResultTable(val_rows + shares), "test": ResultTable(test_rows)}
+
+
+@pytest.fixture(scope="module")
+def split_page(split_tables, tmp_path_factory) -> str:
+    path = tmp_path_factory.mktemp("splits") / "page.md"
+    return render_page(path, "paper", parse_study(["table2"]), split_tables, [])
+
+
+def test_orderings_on_the_test_split_stand_next_to_those_on_val(split_page):
+    orderings, rest = split_page.split("### On the split `test`, evaluated once")
+    test_section, _ = rest.split("## The three tables")
 
     # Verdicts are about `test`. In the paper w gains 71.40 - 66.48 points, and w is 71.40 - 69.24 points above TDE.
     cells = read_lines(test_section)
@@ -597,12 +603,16 @@ def test_orderings_on_the_test_split_stand_next_to_those_on_val(tmp_path):
     assert "`hoz`" not in test_section
     assert read_lines(orderings)["rooms: `org` + w over `org`"][-1] == "holds"
 
-    # SR on `test` is the last column of a world in the three tables.
+
+def test_sr_on_the_test_split_is_the_last_column_of_a_world_in_the_three_tables(split_page):
+    paper_tables = split_page.split("## The three tables")[1]
     table_1 = read_lines(paper_tables.split("###")[1])
     assert [cell.partition(" ")[0] for cell in table_1["`org` + w"][-4:]] == ["75.0", "-", "-", "71.0"]
 
-    # Without results on `test` there is neither the section nor the column.
-    text = render_page(tmp_path / "page.md", "paper", parse_study(["table2"]), {"val": tables["val"]}, [])
+
+def test_pages_without_results_on_the_test_split_have_neither_its_section_nor_its_column(split_tables, tmp_path):
+    tables = {"val": split_tables["val"]}
+    text = render_page(tmp_path / "page.md", "paper", parse_study(["table2"]), tables, [])
     assert "evaluated once" not in text
     assert "test: SR" not in text
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 from support.episodes import episodes_in
-from support.intervals import around, bounds
+from support.intervals import bounds, student_interval
 
 import jaxnav
 from jaxnav.baselines.frontier import run_frontier_search
@@ -161,7 +161,7 @@ def test_chance_is_random_in_other_scenes_for_the_same_policies(make_bench):
     # The leads by scene are 100, 50 and 25 points: their mean is 175 / 3, and its variance is
     # (41.7^2 + 8.3^2 + 33.3^2) / 2 / 3 = 486.1. The interval is for these two runs, so their spread of 50 points does
     # not count.
-    assert bounds(lead) == pytest.approx(around(175 / 3, 17500 / 36, 2))
+    assert bounds(lead) == pytest.approx(student_interval(175 / 3, 17500 / 36, 2))
 
     # Random choices of this method are random actions, so `chance` is the only comparison with them.
     assert not table.where(reference="random").rows

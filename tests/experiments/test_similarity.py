@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.distance import cosine
 from scipy.stats import linregress, pearsonr, spearmanr
 from support.episodes import episodes_in
-from support.intervals import around, bounds, left_out
+from support.intervals import bounds, student_interval, two_way_jackknife_interval
 
 from jaxnav.evaluation.episodes import EpisodeList
 from jaxnav.evaluation.statistics import correlation_interval, scene_clusters
@@ -134,7 +134,7 @@ def test_the_interval_of_success_is_that_of_a_plain_loop():
 
     # The bounds are those of z, transformed back.
     for interval, correlate in ((relation.pearson, pearsonr), (relation.spearman, spearmanr)):
-        expected_z = left_out(functools.partial(fisher_z_without, correlate), num_scenes, num_runs)
+        expected_z = two_way_jackknife_interval(functools.partial(fisher_z_without, correlate), num_scenes, num_runs)
         assert bounds(interval) == pytest.approx(np.tanh(expected_z))
 
 
@@ -180,7 +180,7 @@ def test_room_types_keep_their_shares():
     fisher_z = np.arctanh(relation.pearson.mean)
     squares = np.array([(np.arctanh(pearson_without(scene)) - fisher_z) ** 2 for scene in range(7)])
     variance = ((room_sizes - 1) / room_sizes * squares).sum()
-    assert bounds(relation.pearson) == pytest.approx(np.tanh(around(fisher_z, variance, 7 - 2)))
+    assert bounds(relation.pearson) == pytest.approx(np.tanh(student_interval(fisher_z, variance, 7 - 2)))
 
 
 def test_only_success_that_follows_similarity_correlates():
@@ -275,8 +275,8 @@ def test_the_interval_of_gains_is_that_of_a_plain_loop():
         return np.arctanh(line_without(left_out_scene, left_out_run)[2])
 
     # The slope is in points per 0.1 of similarity.
-    expected_slope = left_out(slope_without, num_scenes, num_runs, arms=2)
-    expected_z = left_out(fisher_z_without, num_scenes, num_runs, arms=2)
+    expected_slope = two_way_jackknife_interval(slope_without, num_scenes, num_runs, arms=2)
+    expected_z = two_way_jackknife_interval(fisher_z_without, num_scenes, num_runs, arms=2)
     assert bounds(relation.slope) == pytest.approx(expected_slope)
     assert bounds(relation.pearson) == pytest.approx(np.tanh(expected_z))
 
@@ -293,7 +293,7 @@ def test_runs_that_disagree_widen_the_interval_of_the_slope():
     # Gains rise by 4 points per 0.1 in all scenes. With 7 and 1 points in the runs of the variant, the mean without
     # either run moves by 3: variance 1 / 2 x (3^2 + 3^2) by run, with two degrees of freedom for two arms of two runs.
     assert bounds(slopes[0.0]) == pytest.approx((4, 4, 4))
-    assert bounds(slopes[0.3]) == pytest.approx(around(4, 9, 2))
+    assert bounds(slopes[0.3]) == pytest.approx(student_interval(4, 9, 2))
 
 
 def test_a_gain_that_falls_with_similarity_has_a_negative_slope():

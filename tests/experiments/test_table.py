@@ -4,12 +4,13 @@ import json
 import math
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.intervals import bounds
+from support.result_rows import make_curve, make_row
 
 from jaxnav.errors import InputError
 from jaxnav.evaluation.statistics import Interval
@@ -25,17 +26,6 @@ from jaxnav.experiments.table import (
 )
 
 SETTINGS = {"split": "val", "shifts": [0.0, 1.0], "run": {"method": "org", "seeds": 3}}
-
-
-def make_row(value: Interval | Curve | float = 50.0, **fields: Any) -> ResultRow:
-    """Row of a run in rooms."""
-    row_value = value if isinstance(value, Interval | Curve) else Interval(value)
-    return ResultRow(**{"world": "rooms", "run": "org", "metric": "sr", **fields}, value=row_value)
-
-
-def make_curve(*mean: float, half_width: float = math.nan) -> Curve:
-    mean_array = np.array(mean)
-    return Curve(np.arange(len(mean), dtype=float), mean_array, mean_array - half_width, mean_array + half_width)
 
 
 def write_and_read(path: Path, *rows: ResultRow) -> list[ResultRow]:
@@ -142,7 +132,7 @@ def test_fields_that_all_rows_share_are_written_once(tmp_path):
     path = tmp_path / "part.jsonl"
     write_part(path, {}, [make_row(float(number), metric=f"metric{number}") for number in range(3)])
     head, *row_objects = map(json.loads, path.read_text().splitlines())
-    assert head["shared"] == {"world": "rooms", "run": "org"}
+    assert head["shared"] == {"world": "rooms", "run": "main"}
     assert row_objects == [{"metric": f"metric{number}", "mean": number} for number in range(3)]
 
 
@@ -164,7 +154,7 @@ def test_zero_keeps_its_sign(tmp_path, means):
 def test_fields_keep_all_digits_so_that_rows_are_found_by_them(tmp_path):
     shift = 1 / 3
     table = ResultTable(write_and_read(tmp_path / "part.jsonl", make_row(1 / 3, shift=shift)))
-    assert table.find(world="rooms", run="org", metric="sr", shift=shift).mean == 0.3333333
+    assert table.find(world="rooms", run="main", metric="sr", shift=shift).mean == 0.3333333
 
 
 def test_undefined_rows_are_left_out(tmp_path):
@@ -256,7 +246,7 @@ TABLE = ResultTable(
 
 
 def test_rows_are_found_by_all_of_their_fields():
-    fields = {"world": "rooms", "run": "org", "metric": "sr"}
+    fields = {"world": "rooms", "run": "main", "metric": "sr"}
     assert TABLE.find(fields, variant="layout", shift=0.0).mean == 70.0
     assert TABLE.find(fields, variant="layout", shift=0.0, reference="baseline").mean == 10.0
     assert TABLE.find(fields, run="hoz").mean == 5.0  # the later field counts
@@ -273,8 +263,8 @@ def test_rows_are_found_by_all_of_their_fields():
 def test_rows_with_equal_fields_must_have_equal_values():
     # Experiments that share a folder may share results, such as those of frontier search. The scenes are not compared.
     table = ResultTable([make_row(1.0, scenes=80), make_row(1.0, scenes=40)])
-    assert table.find(world="rooms", run="org", metric="sr").mean == 1.0
-    with pytest.raises(InputError, match="org"):
+    assert table.find(world="rooms", run="main", metric="sr").mean == 1.0
+    with pytest.raises(InputError, match="main"):
         ResultTable([make_row(1.0), make_row(2.0)])
 
 
@@ -282,17 +272,17 @@ def test_rows_are_selected_by_some_of_their_fields():
     baselines = TABLE.where({"variant": "baseline"}, world="rooms")
     assert [row.shift for row in baselines.rows] == [0.0, 1.0]
     assert TABLE.where(variant="tde").rows == ()
-    assert TABLE.distinct("variant", run="org") == ["baseline", "layout", ""]
+    assert TABLE.distinct("variant", run="main") == ["baseline", "layout", ""]
     assert TABLE.distinct("shift", variant="layout", metric="sr") == [0.0]
     assert TABLE.num_scenes(variant="baseline") == 80
     assert TABLE.num_scenes(variant="baseline", shift=1.0) == 40
 
 
 def test_a_curve_is_read_at_a_position():
-    fields = {"world": "rooms", "run": "org", "metric": "gap"}
+    fields = {"world": "rooms", "run": "main", "metric": "gap"}
     assert TABLE.curve(fields).mean.tolist() == [0.9, 0.7, 0.5]
     interval = TABLE.find_at(2, fields)
-    assert (interval.mean, interval.low, interval.high) == pytest.approx((0.5, 0.4, 0.6))
+    assert bounds(interval) == pytest.approx((0.5, 0.4, 0.6))
 
     # Values are undefined behind the end, in missing rows, and in rows without a curve.
     assert math.isnan(TABLE.find_at(3, fields).mean)

@@ -1,4 +1,4 @@
-"""Adaptation by a learned loss, against gradient steps on whole kernels of one's own."""
+"""Adaptation by a learned loss equals gradient steps on the full kernels of each episode."""
 
 import dataclasses
 import functools
@@ -77,12 +77,13 @@ def run_package(spec, weights, adaptation, observation, action, cut=0):
 
 
 def run_reference(spec, weights, observation, action, order=2, cut=0):
-    """Logits [27, A] of one episode whose kernels take the steps themselves: the rule as SAVN's code has it.
+    """Logits [27, A] of one episode by the rule of SAVN's code.
 
-    After each window the gradient of the learned loss by the kernels and biases that act is taken with the hidden
-    state before the window and experience as they were. With `order` 1 it is no function of anything but the loss's
-    parameters, with `order` 0 it is a constant. What was stored before `cut` is a constant, too: the changes of the
-    kernels, the memory and the inputs of the window.
+    After each of the first four windows, every kernel of this episode takes one gradient step of the learned loss,
+    computed by autodiff, along the recorded pathways and from the hidden state before the window. `order` 2: the step
+    is differentiated through everything. `order` 1: only through the parameters of the learned loss. `order` 0: the
+    step is a constant. State from before `cut` is a constant: the changes of the kernels, the memory and the inputs of
+    the window.
     """
     fast_weights = weights
     memory = bind(spec, weights).initial_memory()
@@ -148,7 +149,7 @@ def window_loss(spec, window, method_weights, fast_layers):
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("spec_name", SPECS)
 def test_adaptation_by_factors_equals_gradient_steps_on_whole_kernels(spec_name):
-    """The sum of factors, of rank 24, is the change that autodiff makes to kernels of the episode's own."""
+    """The sum of factors, of rank 24, is the change that autodiff makes to the full kernels of the episode."""
     spec = SPECS[spec_name]
     observation, action = random_episode(0)
     weights = tiny.random_params(0, spec)
@@ -252,7 +253,7 @@ def test_each_episode_of_a_batch_adapts_as_it_does_alone():
     run_adapted = jax.jit(functools.partial(run_package, SAVN, tiny.random_params(0, SAVN), adaptation))
     logits, _ = run_adapted(*episodes)
 
-    # Another fifth episode changes no other one.
+    # Replacing episode 5 changes the logits of episode 5 only.
     changed_episodes = jax.tree.map(lambda leaf: leaf.at[:, 5].set(leaf[:, 6]), episodes)
     changed_logits, _ = run_adapted(*changed_episodes)
     is_other_episode = np.arange(16) != 5

@@ -14,6 +14,7 @@ from support import tiny_world as tiny
 from support.scenes import BOOK, CATEGORIES, CHAIR, FRIDGE, corridor_scene
 
 from jaxnav.causal import do, remove_from_sum, stde, tde
+from jaxnav.env.objectnav import NUM_PRIORS
 from jaxnav.errors import InputError
 from jaxnav.evaluation.removal import apply_removal
 from jaxnav.evaluation.variants import inference_grid, table_row
@@ -193,7 +194,8 @@ def test_only_reachable_unexplored_squares_are_targets():
     expected = np.zeros((16, 16), bool)
     expected[7, 6] = True  # cell (15, 13)
     np.testing.assert_array_equal(has_target, expected)
-    np.testing.assert_allclose(log_cost[7, 6], np.log(4 + 6.0), rtol=1e-6)  # four steps, six more actions
+    # Four steps, plus the 6 extra actions that `travel_costs` adds to every distance.
+    np.testing.assert_allclose(log_cost[7, 6], np.log(4 + 6.0), rtol=1e-6)
 
 
 def test_box_sums_wrap_around():
@@ -358,8 +360,8 @@ def test_rates_are_hits_per_look_and_rare_categories_have_the_mean_rate():
     look_counts[0, 0] = 98.0
     hits[0, 0] = 73.5
     rates = np.asarray(detection_rates(LookCounts(jnp.asarray(look_counts), jnp.asarray(hits))))
-    # The mean is 74 / 99. Two looks with the mean rate are added to the 98 looks, (73.5 + 2 x 74 / 99) / 100, and a
-    # category without looks has the mean itself.
+    # Mean rate (73.5 + 0.5) / (98 + 1) = 74 / 99. Two looks with the mean rate are added to the 98 looks,
+    # (73.5 + 2 x 74 / 99) / 100, and a category without looks has the mean rate itself.
     np.testing.assert_allclose(rates[:, 0], [(73.5 + 148 / 99) / 100, 74 / 99], rtol=1e-5)
     np.testing.assert_allclose(rates[:, 1], [0.5, 0.5], rtol=1e-5)
 
@@ -478,10 +480,12 @@ def test_documented_predictor_scores_by_its_weights():
 
 
 def test_home_larger_than_the_map_is_refused():
+    # A corridor of 90 lines and the 11 of a view.
     bank = compile_bank([corridor_scene(90)], Task(CATEGORIES))
+    knowledge = Knowledge(jnp.zeros((NUM_PRIORS, NUM_CATEGORIES, NUM_CATEGORIES)))
     with pytest.raises(InputError, match=r"search on a map: scene drawn needs a map of 101 x 101 cells.* 96 x 96"):
-        check_belief_map(Knowledge(jnp.zeros((5, 3, 3))), bank)
-    check_belief_map(Knowledge(jnp.zeros((5, 3, 3))), tiny.BANK)
+        check_belief_map(knowledge, bank)
+    check_belief_map(knowledge, tiny.BANK)
 
 
 def test_home_objects_have_as_many_entries_as_the_fullest_home():

@@ -212,12 +212,19 @@ def test_half_of_the_reference_removal_lies_midway():
     agent = OWN_FALLBACK_LOOP.start(KEY, BATCH_SIZE, decider.initial_memory((BATCH_SIZE,)), KNOWLEDGE, PARAMS)
     memory = agent.memory
     assert memory is not None
-    pathways = decider.pathways(OWN_FALLBACK_LOOP.policy_inputs(agent, KNOWLEDGE, PARAMS), memory)
+    inputs = OWN_FALLBACK_LOOP.policy_inputs(agent, KNOWLEDGE, PARAMS)
+    pathways = decider.pathways(inputs, memory)
     factual_logits = decider.decide(pathways, memory).logits
     counterfactual_logits = decider.decide(do(pathways, scene=0.0, goal=0.0), memory).logits
-    logits_without_experience = tde(factual_logits, counterfactual_logits)
     half_removed = stde(factual_logits, counterfactual_logits, jnp.full(BATCH_SIZE, 0.5), 0.0, "paper")
-    np.testing.assert_allclose(half_removed, (factual_logits + logits_without_experience) / 2, atol=1e-6)
+
+    # The logits a0 of the plain network, whose memory has never held experience.
+    network = OWN_FALLBACK_LOOP.bind(EXPERIENCED_PARAMS)
+    any_action = jnp.zeros(BATCH_SIZE, jnp.int32)
+    (logits_without_experience,) = replay_logits(network, [inputs], [any_action], 0.0)
+    expected = (factual_logits + round_to_grid(logits_without_experience)) / 2
+    np.testing.assert_allclose(half_removed, expected, atol=1e-6)
+    assert np.abs(factual_logits - logits_without_experience).max() > 0.05
 
 
 @pytest.mark.exhaustive

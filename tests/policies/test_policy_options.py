@@ -16,6 +16,8 @@ from support.tiny_world import BANK, SIZES, SPEC, random_params
 from jaxnav.causal import do
 from jaxnav.env.objectnav import Observation
 from jaxnav.policies.features import scale_geometry, unpack_features
+from jaxnav.policies.method import Stage
+from jaxnav.policies.methods import find_method
 from jaxnav.policies.network import DONE_GATE, bind, init_params
 from jaxnav.policies.pathways import Pathways, PolicyInputs, PolicyState
 from jaxnav.policies.spec import Direct, PolicySpec
@@ -267,3 +269,25 @@ def test_specs_of_earlier_versions_have_raw_weights():
 def test_unknown_kind_of_weights_is_refused():
     with pytest.raises(ValueError, match="weight_kind is 'squared'; choose one of raw, relative, pixel"):
         dataclasses.replace(SPEC, weight_kind="squared")
+
+
+def test_unknown_detections_of_the_direct_pathway_are_refused():
+    with pytest.raises(ValueError, match="direct is 'goals'; choose one of"):
+        dataclasses.replace(SPEC, direct="goals")
+
+
+def test_methods_that_host_the_layout_keep_all_categories():
+    """Layout weights belong to all categories, and `anonymous` perceives the goal alone."""
+    method = dataclasses.replace(find_method("anonymous"), hosts_layout=True)
+    with pytest.raises(ValueError, match="hosts_layout=False"):
+        init_params(dataclasses.replace(SPEC, method=method), jax.random.key(0))
+
+
+def test_a_stage_without_adaptation_comes_first_or_last():
+    """Between two stages with adaptation, new episodes would inherit the fast weights of ended ones."""
+    method = find_method("savn")
+    without_adaptation = Stage(0.5, adapts_online=False)
+    for stages in ((without_adaptation, Stage(0.5)), (Stage(0.5), without_adaptation)):
+        assert dataclasses.replace(method, stages=stages).stages == stages
+    with pytest.raises(ValueError, match="put this stage first or last"):
+        dataclasses.replace(method, stages=(Stage(0.25), without_adaptation, Stage(0.25)))

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import tiny_world as tiny
+from support.walks import draw_walk_actions
 
 from jaxnav.env.make import build_environment
 from jaxnav.evaluation.episodes import draw_episodes
@@ -17,7 +18,7 @@ from jaxnav.policies.methods import find_method
 from jaxnav.policies.methods.tpn import PoseTracker, learn_motion
 from jaxnav.policies.pathways import NO_ACTION
 from jaxnav.scenes.tables.compile import compile_bank
-from jaxnav.scenes.task import LOOK_DOWN, LOOK_UP, MOVE_AHEAD, NUM_ACTIONS, ROTATE_LEFT, ROTATE_RIGHT
+from jaxnav.scenes.task import LOOK_DOWN, LOOK_UP, MOVE_AHEAD, ROTATE_LEFT, ROTATE_RIGHT
 from jaxnav.scenes.worlds import WORLDS, make_generated_scenes
 
 
@@ -92,10 +93,7 @@ def test_exactly_the_repeated_poses_of_random_walks_are_recognised(world):
         start = agent_loop.start_from(start_states(episodes), None, knowledge, params)
 
         def step(agent, key):
-            # Of ten actions, six are moves ahead; each turn and each look is one, and none is Done.
-            random_action = jax.random.randint(key, (num_walks,), 0, 2 * (NUM_ACTIONS - 1))
-            action = jnp.where(random_action < NUM_ACTIONS - 1, random_action, MOVE_AHEAD)
-            agent, _ = agent_loop.step(agent, action, knowledge, params)
+            agent, _ = agent_loop.step(agent, draw_walk_actions(key, num_walks), knowledge, params)
             return agent, (agent.state.pose, agent_loop.policy_inputs(agent, knowledge, params).reading)
 
         _, (poses, is_repeated) = jax.lax.scan(step, start, jax.random.split(key, num_steps))

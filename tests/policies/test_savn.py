@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import tiny_world as tiny
-from support.rollouts import ENV, ENVS, KNOWLEDGE, LENGTH, PARAMS
+from support.rollouts import ENV, ENVS, KNOWLEDGE, PARAMS, choice_log_probs, collect_rollouts
 
 from jaxnav.evaluation import grid
 from jaxnav.evaluation.episodes import draw_episodes
@@ -20,7 +20,7 @@ from jaxnav.policies.agent_loop import AgentLoop, policy_memory
 from jaxnav.policies.methods import find_method
 from jaxnav.policies.testing import check_method
 from jaxnav.training.config import PPOConfig
-from jaxnav.training.ppo import Learner, collect_rollout, replay_rollout
+from jaxnav.training.ppo import Learner, replay_rollout
 
 SPEC = dataclasses.replace(tiny.SPEC, method=find_method("savn"), method_sizes=())
 AGENT_LOOP = AgentLoop(ENV, SPEC)
@@ -39,22 +39,18 @@ def has_changes(fast_weights: Any) -> np.ndarray:
 @pytest.mark.slow
 def test_replay_decides_and_adapts_as_the_rollout_did():
     policy_params = tiny.random_params(3, SPEC)
+    agents, rollouts = collect_rollouts(AGENT_LOOP, policy_params, seeds=(1, 2))
+    agent = agents[-1]
+    rollout = rollouts[-1]
+    transitions = rollout.transitions
 
     @jax.jit
-    def collect_and_replay():
-        # The second rollout begins within episodes.
+    def replay():
         policy = AGENT_LOOP.bind(policy_params)
-        agent = AGENT_LOOP.start(jax.random.key(0), ENVS, policy.initial_memory((ENVS,)), KNOWLEDGE, PARAMS)
-        for number in (1, 2):
-            agent, rollout = collect_rollout(
-                AGENT_LOOP, policy, agent, jax.random.key(number), PARAMS, KNOWLEDGE, num_steps=LENGTH
-            )
-        return agent, rollout, replay_rollout(policy, rollout.transitions, rollout.initial_memory, PARAMS).factual
+        return replay_rollout(policy, transitions, rollout.initial_memory, PARAMS).factual
 
-    agent, rollout, decisions = collect_and_replay()
-    transitions = rollout.transitions
-    log_probs = jax.nn.log_softmax(decisions.logits)
-    log_prob = jnp.take_along_axis(log_probs, transitions.choice[..., None], axis=-1)[..., 0]
+    decisions = replay()
+    log_prob = choice_log_probs(decisions.logits, transitions.choice)
     np.testing.assert_allclose(log_prob, transitions.log_prob, rtol=1e-4, atol=1e-4)
 
     # Episodes that go on have the changes of the last replayed step.

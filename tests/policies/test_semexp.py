@@ -13,7 +13,7 @@ from support.scenes import BOOK, CATEGORIES, FRIDGE, corridor_scene
 from support.tiers import params_by_tier
 
 from jaxnav.env.make import build_environment
-from jaxnav.env.objectnav import State
+from jaxnav.env.objectnav import NUM_PRIORS, State
 from jaxnav.errors import InputError
 from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.evaluation.grid import start_states
@@ -52,7 +52,8 @@ BANK = compile_bank([CORRIDOR], Task(CATEGORIES, detector=PERFECT_DETECTOR))
 ENV, PARAMS = build_environment(BANK, {}, 100)
 #: Headings of an agent in the corridor; the book is in the north.
 NORTH, SOUTH = 0, 4
-FLOOR_AND_WALL_BITS = np.uint32(7)
+#: Map bits of the three categories; floor and walls have higher bits.
+CATEGORY_BITS = np.uint32((1 << len(CATEGORIES)) - 1)
 
 
 def make_knowledge(bank=BANK):
@@ -282,15 +283,15 @@ def test_layout_weights_reach_only_the_experience_by_categories_on_the_map():
     np.testing.assert_array_equal(pathways.goal, reweighted_pathways.goal)
 
     # The categories on the map are no part of the direct pathway.
-    categories_only = inputs.reading._replace(blocks=map_blocks & ~FLOOR_AND_WALL_BITS)
-    floor_and_walls_only = inputs.reading._replace(blocks=map_blocks & FLOOR_AND_WALL_BITS)
-    pathways_of_categories = policy.pathways(inputs._replace(reading=categories_only))
-    np.testing.assert_array_equal(pathways.scene, pathways_of_categories.scene)
+    without_categories = inputs.reading._replace(blocks=map_blocks & ~CATEGORY_BITS)
+    pathways_without_categories = policy.pathways(inputs._replace(reading=without_categories))
+    np.testing.assert_array_equal(pathways.scene, pathways_without_categories.scene)
 
     # Floor and walls are no part of Z.
-    pathways_of_floor = policy.pathways(inputs._replace(reading=floor_and_walls_only))
-    np.testing.assert_array_equal(pathways.experience, pathways_of_floor.experience)
-    assert np.abs(pathways.scene - pathways_of_floor.scene).max() > 1e-3
+    with_categories_only = inputs.reading._replace(blocks=map_blocks & CATEGORY_BITS)
+    pathways_of_categories_only = policy.pathways(inputs._replace(reading=with_categories_only))
+    np.testing.assert_array_equal(pathways.experience, pathways_of_categories_only.experience)
+    assert np.abs(pathways.scene - pathways_of_categories_only.scene).max() > 1e-3
 
 
 # Setup
@@ -341,7 +342,7 @@ def test_nearest_frontier_finds_most_goals_of_homes_without_learning(world_name)
     scenes = make_generated_scenes(world_name, "val", 3)
     bank = compile_bank([scenes[index] for index in range(3)], preset.task)
     env, params = build_environment(bank, {}, preset.step_limit)
-    prior = jnp.ones((6, len(env.categories), len(env.categories)))
+    prior = jnp.ones((NUM_PRIORS, len(env.categories), len(env.categories)))
     knowledge = make_knowledge(bank)._replace(priors=prior)
     agent_loop = make_agent_loop("jaxnav.policies.methods.semexp:NEAREST", env)
     start_state = start_states(draw_episodes(bank, num_episodes, seed=0))
@@ -368,9 +369,10 @@ def test_nearest_frontier_finds_most_goals_of_homes_without_learning(world_name)
         _, _, success = jax.lax.while_loop(any_running, step, (first_agent, running, ~running))
         return success.mean()
 
+    # Measured: 0.90 in apartments, 0.98 in houses.
     assert float(success_rate(start_state, knowledge.method)) > 0.85
-    # Done already at 1.45 m.
+    # Done already at 1.45 m. Measured: 0.22 in apartments, 0.40 in houses.
     assert float(success_rate(start_state, knowledge.method | {"enough": jnp.float32(1.45)})) < 0.6
     if world_name == "apartments":
-        # Only the level horizon.
+        # Only the level horizon. Measured: 0.17.
         assert float(success_rate(start_state, knowledge.method | {"horizons": jnp.int32(1)})) < 0.2

@@ -11,6 +11,7 @@ import pytest
 from support import tiny_world as tiny
 from support.rollouts import ENV, KNOWLEDGE, PARAMS
 from support.tiers import params_by_tier
+from support.walks import draw_walk_actions
 
 import jaxnav
 from jaxnav.causal import do
@@ -23,7 +24,7 @@ from jaxnav.scenes.lattice import standable_cells
 from jaxnav.scenes.scene import Scene
 from jaxnav.scenes.tables.compile import compile_bank
 from jaxnav.scenes.tables.observation_row import VIEW_BLOCKED, VIEW_FREE, RowFormat
-from jaxnav.scenes.task import DONE, MOVE_AHEAD, NUM_ACTIONS, Rules
+from jaxnav.scenes.task import DONE, MOVE_AHEAD, Rules
 from jaxnav.scenes.worlds import WORLDS, make_generated_scenes
 
 NUM_STEPS = 60
@@ -63,10 +64,7 @@ def random_walks(request):
         start = agent_loop.start(key, NUM_WALKS, None, None, params)
 
         def step(agent, key):
-            # Of ten actions, six are moves ahead; each turn and each look is one, and none is Done.
-            random_action = jax.random.randint(key, (NUM_WALKS,), 0, 2 * (NUM_ACTIONS - 1))
-            action = jnp.where(random_action < NUM_ACTIONS - 1, random_action, MOVE_AHEAD)
-            agent, _ = agent_loop.step(agent, action, None, params)
+            agent, _ = agent_loop.step(agent, draw_walk_actions(key, NUM_WALKS), None, params)
             return agent, env.cell_of_pose(agent.state.pose)
 
         agent, cells = jax.lax.scan(step, start, jax.random.split(key, NUM_STEPS))

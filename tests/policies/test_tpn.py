@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from flax import nnx
 from support import tiny_world as tiny
-from support.rollouts import ENV, ENVS, LENGTH, PARAMS, changed_parts, choice_log_probs
+from support.rollouts import ENV, ENVS, LENGTH, PARAMS, changed_parts, choice_log_probs, collect_rollouts
 
 from jaxnav.causal import do
 from jaxnav.env.objectnav import Observation
@@ -29,7 +29,7 @@ from jaxnav.policies.network import NO_CHANGES, bind
 from jaxnav.policies.pathways import NO_ACTION, PolicyInputs, PolicyState
 from jaxnav.scenes.task import NUM_ACTIONS
 from jaxnav.training.config import PPOConfig
-from jaxnav.training.ppo import Learner, collect_rollout, replay_rollout
+from jaxnav.training.ppo import Learner, replay_rollout
 
 HIDDEN_SIZE = tiny.SIZES.hidden
 BATCH_SIZE = 32
@@ -258,7 +258,7 @@ def test_agent_without_trials_decides_without_changes(agent_loop):
 
 
 @pytest.mark.slow
-def test_policy_without_inner_steps_is_replayed_in_parallel():
+def test_policy_without_inner_steps_has_no_adaptation():
     policy = dataclasses.replace(AGENT_LOOP, inner_steps=0).bind(tiny.random_params(0, SPEC))
     assert policy.adaptation is None
 
@@ -329,21 +329,16 @@ def test_tentative_policy_learns_the_actions_of_shortest_paths(params):
 @pytest.mark.exhaustive
 def test_replay_of_tpn_recomputes_log_probs_and_actor_changes():
     weights = tiny.random_params(3, SPEC)
+    agents, rollouts = collect_rollouts(AGENT_LOOP, weights, seeds=(1, 2), knowledge=KNOWLEDGE)
+    agent = agents[-1]
+    rollout = rollouts[-1]
+    transitions = rollout.transitions
 
     @jax.jit
-    def collect_and_replay():
-        policy = AGENT_LOOP.bind(weights)
-        memory = policy.initial_memory((ENVS,))
-        agent = AGENT_LOOP.start(jax.random.key(0), ENVS, memory, KNOWLEDGE, PARAMS)
-        for seed in (1, 2):
-            agent, rollout = collect_rollout(
-                AGENT_LOOP, policy, agent, jax.random.key(seed), PARAMS, KNOWLEDGE, num_steps=LENGTH
-            )
-        replayed = replay_rollout(policy, rollout.transitions, rollout.initial_memory, PARAMS)
-        return agent, rollout, replayed.factual
+    def replay():
+        return replay_rollout(AGENT_LOOP.bind(weights), transitions, rollout.initial_memory, PARAMS).factual
 
-    agent, rollout, decisions = collect_and_replay()
-    transitions = rollout.transitions
+    decisions = replay()
     log_prob = choice_log_probs(decisions.logits, transitions.choice)
     np.testing.assert_allclose(log_prob, transitions.log_prob, rtol=1e-4, atol=1e-4)
 

@@ -79,7 +79,7 @@ def random_mazes(num_mazes):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("num_mazes", [50, 1000])
+@pytest.mark.parametrize("num_mazes", [50, pytest.param(1000, marks=pytest.mark.exhaustive)])
 def test_paths_are_as_long_as_those_of_a_queue(num_mazes):
     targets, passable, start = random_mazes(num_mazes)
     lengths = np.asarray(find_paths(targets, passable, start).length)

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from support.commands import train
 from support.fuzz import KINDS, fuzz
-from support.processes import REPOSITORY, run
+from support.processes import REPOSITORY, start_python
 from support.refusals import assert_message_names
 from support.tiny_run import write_config
 from support.tiny_world import BANK
@@ -220,7 +220,7 @@ def test_random_input_ends_commands_by_exit_code(kind, tmp_path):
 @pytest.mark.parametrize("kind", KINDS)
 def test_two_hundred_random_inputs_stay_within_time_and_memory(kind):
     """The inputs have a process, and so a peak memory, of their own; docs/promises.md has the command for more."""
-    process = run(["-m", "support.fuzz", kind, 200, 1], PYTHONPATH=REPOSITORY / "tests")
+    process = start_python(["-m", "support.fuzz", kind, 200, 1], PYTHONPATH=REPOSITORY / "tests")
     output, error = process.communicate()
     assert process.returncode == 0, error[-2000:]
     result = json.loads(output.splitlines()[-1])

@@ -11,7 +11,7 @@ import time
 import pytest
 from rich.console import Console
 from support.commands import train
-from support.processes import ends, free_address, run, start
+from support.processes import free_address, start_python, start_training_process, wait_for_processes
 from support.tiny_run import write_config
 
 from jaxnav.cli.console import run_command
@@ -47,7 +47,7 @@ def test_interrupted_run_saves_and_resumes_bit_for_bit(undisturbed_dir, tmp_path
     run_dir = tmp_path / "ended[1]"
 
     # Interrupt the training after its first chunk.
-    process = run(["train.py", "--config", config_file, "--run-dir", run_dir, *LONG_RUN])
+    process = start_python(["train.py", "--config", config_file, "--run-dir", run_dir, *LONG_RUN])
     while process.poll() is None and not (run_dir / "metrics.jsonl").exists():
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
@@ -81,11 +81,11 @@ def test_signal_to_one_process_ends_both_at_the_same_chunk(tmp_path):
     second_address = free_address()
 
     # Signal one of two processes after the first chunk.
-    processes = [start(first_address, index, config_file, run_dir, *LONG_RUN) for index in range(2)]
+    processes = [start_training_process(first_address, index, config_file, run_dir, *LONG_RUN) for index in range(2)]
     while all(process.poll() is None for process in processes) and not (run_dir / "metrics.jsonl").exists():
         time.sleep(0.02)
     processes[1].send_signal(signal.SIGTERM)
-    exit_codes, messages = ends(*processes, timeout=2 * TIME_LIMIT_S)
+    exit_codes, messages = wait_for_processes(*processes, timeout=2 * TIME_LIMIT_S)
     assert exit_codes == [143, 143], messages
 
     # Both name the same update, which has the only checkpoint.
@@ -94,8 +94,8 @@ def test_signal_to_one_process_ends_both_at_the_same_chunk(tmp_path):
     assert [path.name for path in (run_dir / "checkpoints").iterdir()] == [last_update]
 
     # The same commands resume after this update.
-    processes = [start(second_address, index, config_file, run_dir, *LONG_RUN) for index in range(2)]
-    exit_codes, messages = ends(*processes)
+    processes = [start_training_process(second_address, index, config_file, run_dir, *LONG_RUN) for index in range(2)]
+    exit_codes, messages = wait_for_processes(*processes)
     assert exit_codes == [0, 0], messages
     assert f"resumed after update {last_update} of 60" in messages[0]
 

@@ -8,7 +8,7 @@ import signal
 import time
 
 import pytest
-from support.processes import run
+from support.processes import start_python
 from support.tiny_run import NUM_SEEDS, POLICY_NAMES, write_config
 
 from jaxnav.store.files import read_log_rows
@@ -17,7 +17,7 @@ from jaxnav.store.files import read_log_rows
 def start(config_file, run_dir, *options):
     """Start the train command in a process of its own, with the compiled programs of the whole suite."""
     command = ["train.py", "--config", config_file, "--run-dir", run_dir, *options]
-    return run(command, JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0)
+    return start_python(command, JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0)
 
 
 def finish(process):

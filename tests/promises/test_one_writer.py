@@ -17,7 +17,7 @@ import time
 
 import pytest
 from support.commands import train
-from support.processes import REPOSITORY, run
+from support.processes import REPOSITORY, start_python
 from support.tiny_run import tiny_config, write_config
 
 from jaxnav.errors import InputError
@@ -150,7 +150,7 @@ def test_train_refuses_a_second_process_and_ends_when_its_directory_is_removed(t
     long_run = ("--total-steps", 10**6)
 
     # A long training in a process of its own, until its first chunk has ended.
-    process = run(["train.py", "--config", config_file, "--run-dir", run_dir, *long_run, "--save-every", 1000])
+    process = start_python(["train.py", "--config", config_file, "--run-dir", run_dir, *long_run, "--save-every", 1000])
     while process.poll() is None and not (run_dir / "metrics.jsonl").exists():
         time.sleep(0.05)
 

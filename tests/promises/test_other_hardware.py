@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 from support.commands import contents
-from support.processes import run
+from support.processes import start_python
 from support.tiny_run import POLICY_NAMES, write_config
 
 from jaxnav.store.export import TOLERANCE, load_params
@@ -26,7 +26,7 @@ def train_on_cores(cores, config_file, run_dir):
     """Run the train command on some cores, and return what it prints on stderr."""
     core_list = ",".join(map(str, cores))
     command = ["-c", TRAIN_ON_CORES, core_list, "--config", config_file, "--run-dir", run_dir]
-    process = run(command, JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0)
+    process = start_python(command, JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0)
     _, messages = process.communicate()
     assert process.returncode == 0, messages
     return messages

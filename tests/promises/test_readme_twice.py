@@ -9,9 +9,9 @@ import shlex
 from pathlib import Path
 
 import pytest
+from support.command_environments import run_jaxnav
 from support.commands import contents
 from support.importer_inputs.procthor import HOUSE
-from support.surroundings import run_jaxnav
 from support.tiny_run import write_config
 
 README = (Path(__file__).parents[2] / "README.md").read_text()

@@ -8,8 +8,8 @@ import gymnasium
 import jax
 import matplotlib as mpl
 import pytest
+from support.command_environments import COMMANDS, ENVIRONMENTS, find_fault, run_jaxnav, try_command
 from support.refusals import assert_message_names
-from support.surroundings import COMMANDS, ENVIRONMENTS, find_fault, run_jaxnav, try_command
 from support.tiers import params_by_tier
 from support.tiny_run import finished_run, tiny_config
 
@@ -180,7 +180,7 @@ def test_characters_outside_a_streams_encoding_are_escaped():
     assert "k\\xfcche" in output
 
 
-# The matrix of commands and environments; `python -m support.surroundings` in `tests` prints all of it
+# The matrix of commands and environments; `python -m support.command_environments` in `tests` prints all of it
 
 #: Each environment with one of the commands that take a second.
 SHORT_CASES = list(zip(ENVIRONMENTS, itertools.cycle(["list", "list", "play"]), strict=False))

@@ -160,6 +160,7 @@ def test_packaged_policy_is_evaluated_with_removal_of_experience(scene_file):
     assert variants == [*["layout", "tde", "stde"] * 2, "random", "oracle"]
     # Intervals are over scenes, because one policy shows no spread between trainings.
     assert results.report["rows"][0]["sr"]["ci95"] is not None
+    assert all(entry["share"]["ci95"] is not None for entry in results.report["decision_shares"])
     assert results.report["run"]["subject"] == "rooms-org"
     assert not any("training seed" in note for note in results.report["notes"])
 

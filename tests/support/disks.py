@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from support.commands import contents, train
-from support.processes import run
+from support.processes import start_python
 from support.tiny_run import write_config
 
 #: Options of `mount` that limit bytes or files, from next to nothing to nearly enough for the tiny run.
@@ -73,7 +73,7 @@ def train_on_small_disk(config_file: Path, disk: Path, limit: str) -> DiskAttemp
     subprocess.run(["mount", "-t", "tmpfs", "-o", limit, "tmpfs", disk], check=True)
     try:
         # Threads of libraries may print until the process ends, so the training has a process of its own.
-        process = run(["-m", "jaxnav", "train", "--config", config_file, "--run-dir", disk / "run"])
+        process = start_python(["-m", "jaxnav", "train", "--config", config_file, "--run-dir", disk / "run"])
         output = "".join(process.communicate())
         exit_code = process.returncode
 

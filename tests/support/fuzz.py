@@ -23,7 +23,7 @@ from jaxnav.runs.policy import load_policy
 from jaxnav.scenes.files.scene_file import write_scenes
 from jaxnav.store.files import DIGEST_KEY, add_digest
 from support import fuzz_importers
-from support.fuzz_importers import NASTY, damaged, mutated
+from support.fuzz_importers import NASTY, damaged, randomly_mutated
 from support.tiny_world import BEDROOM, KITCHEN
 
 #: Words of a command line that are neither options nor names of commands.
@@ -51,7 +51,7 @@ def _run_on_scene_file(folder: Path, rng: random.Random) -> int:
     if rng.random() < 0.3:
         path.write_bytes(damaged(path.read_bytes(), rng))
     else:
-        scenes = [mutated(json.loads(line), rng) for line in gzip.decompress(path.read_bytes()).splitlines()]
+        scenes = [randomly_mutated(json.loads(line), rng) for line in gzip.decompress(path.read_bytes()).splitlines()]
         path.write_bytes(gzip.compress("\n".join(map(json.dumps, scenes)).encode()))
     return main(["scenes", "stats", str(path)])
 
@@ -66,7 +66,7 @@ def _run_on_export(folder: Path, rng: random.Random) -> int:
         path = export / "policy.json"
         policy = json.loads(path.read_text())
         del policy[DIGEST_KEY]
-        policy = mutated(policy, rng)
+        policy = randomly_mutated(policy, rng)
         # A new digest, so that the mutation is not refused as damage; there is none for NaN.
         with contextlib.suppress(ValueError):
             policy = add_digest(policy) if isinstance(policy, dict) else policy
@@ -79,7 +79,7 @@ def _run_on_config(folder: Path, rng: random.Random) -> int:
     path = folder / "run.yaml"
     settings = json.loads(json.dumps(dataclasses.asdict(RunConfig()), default=str))
     chosen_settings = {name: settings[name] for name in rng.sample(sorted(settings), 8)}
-    mutated_settings = mutated(chosen_settings, rng)
+    mutated_settings = randomly_mutated(chosen_settings, rng)
     text = yaml.safe_dump(mutated_settings, allow_unicode=rng.random() < 0.5).encode("utf-8", "replace")
     path.write_bytes(damaged(text, rng) if rng.random() < 0.3 else text)
     return _check_arguments(["--config", str(path)])

@@ -111,7 +111,7 @@ def random_name(rng: random.Random) -> str:
     return rng.choice(_NAME_SEPARATORS).join(name_parts)
 
 
-def mutated(content: object, rng: random.Random) -> object:
+def randomly_mutated(content: object, rng: random.Random) -> object:
     """Return a copy with up to three values deleted, or replaced by nasty values or random names."""
 
     def draw_value() -> object:
@@ -146,7 +146,7 @@ def fuzz(scene_format: Format, num_runs: int, seed: int = 0) -> tuple[collection
 
             # Damage the bytes of a file, or values of its content.
             damages_bytes = rng.random() < 0.3
-            content = scene_format.content if damages_bytes else mutated(scene_format.content, rng)
+            content = scene_format.content if damages_bytes else randomly_mutated(scene_format.content, rng)
             source = scene_format.write(folder / "in", content)
             if damages_bytes:
                 file = rng.choice(sorted(path for path in folder.rglob("*") if path.is_file()))

@@ -16,13 +16,15 @@ def bounds(interval: Interval) -> tuple[float, float, float]:
     return interval.mean, interval.low, interval.high
 
 
-def around(mean: float, variance: float, degrees: float) -> tuple[float, float, float]:
+def student_interval(mean: float, variance: float, degrees: float) -> tuple[float, float, float]:
     """Return a mean with the bounds of Student's t."""
     half = float(t.ppf(0.975, degrees)) * math.sqrt(variance)
     return mean, mean - half, mean + half
 
 
-def left_out(statistic: Statistic, scenes: int, seeds: int, arms: int = 1) -> tuple[float, float, float]:
+def two_way_jackknife_interval(
+    statistic: Statistic, scenes: int, seeds: int, arms: int = 1
+) -> tuple[float, float, float]:
     """Return a statistic and its interval by two-way jackknife.
 
     Scenes are of one room type, and each has a floor plan of its own.
@@ -56,4 +58,4 @@ def left_out(statistic: Statistic, scenes: int, seeds: int, arms: int = 1) -> tu
     run_degrees = arms * (seeds - 1)
     spread = by_scene**2 / scene_degrees + by_run**2 / run_degrees + crossed**2 / (scene_degrees * run_degrees)
     degrees = np.clip(variance**2 / spread, min(scene_degrees, run_degrees), scene_degrees + run_degrees)
-    return around(whole, variance, float(degrees))
+    return student_interval(whole, variance, float(degrees))

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from support.commands import contents
-from support.processes import ends, free_address, run, start
+from support.processes import free_address, start_python, start_training_process, wait_for_processes
 from support.tiny_run import CONFIG_YAML, write_config
 
 HANG_TIMEOUT_S = 300
@@ -38,13 +38,17 @@ base:
 
 
 def _start_training(folder: Path, cache: dict[str, object]) -> list[subprocess.Popen]:
-    return [run(["train.py", "--config", write_config(folder), "--run-dir", folder / "run", *LONG_RUN], **cache)]
+    return [
+        start_python(["train.py", "--config", write_config(folder), "--run-dir", folder / "run", *LONG_RUN], **cache)
+    ]
 
 
 def _start_two_processes(folder: Path, cache: dict[str, object]) -> list[subprocess.Popen]:
     address = free_address()
     config_file = write_config(folder)
-    return [start(address, index, config_file, folder / "run", *LONG_RUN, **cache) for index in range(2)]
+    return [
+        start_training_process(address, index, config_file, folder / "run", *LONG_RUN, **cache) for index in range(2)
+    ]
 
 
 def _start_study(folder: Path, cache: dict[str, object]) -> list[subprocess.Popen]:
@@ -52,7 +56,7 @@ def _start_study(folder: Path, cache: dict[str, object]) -> list[subprocess.Pope
     config_file.write_text(EXPERIMENT_YAML)
     pages = f"{{{folder / 'docs/study.md'}: instrument}}"
     options = ("--results", folder / "results", "--runs", folder / "runs", "--pages", pages)
-    return [run(["-m", "jaxnav", "study", config_file, *options], **cache)]
+    return [start_python(["-m", "jaxnav", "study", config_file, *options], **cache)]
 
 
 #: Functions that start a command of a kind, given its folder and the variables of the compilation cache.
@@ -82,7 +86,7 @@ def kill_at(processes: list[subprocess.Popen], kill_time: float, rng: random.Ran
     for victim in rng.choice([processes, processes[:1], processes[-1:]]):
         victim.kill()
 
-    exit_codes, messages = ends(*processes, timeout=HANG_TIMEOUT_S)
+    exit_codes, messages = wait_for_processes(*processes, timeout=HANG_TIMEOUT_S)
     was_killed = -signal.SIGKILL in exit_codes
     allowed_codes = {0, -signal.SIGKILL}
     if was_killed and len(exit_codes) > 1:
@@ -94,7 +98,7 @@ def kill_at(processes: list[subprocess.Popen], kill_time: float, rng: random.Ran
 
 def wait_for_success(processes: list[subprocess.Popen]) -> None:
     """Wait for processes that have to end with code 0."""
-    exit_codes, messages = ends(*processes, timeout=HANG_TIMEOUT_S)
+    exit_codes, messages = wait_for_processes(*processes, timeout=HANG_TIMEOUT_S)
     if any(exit_codes):
         raise SystemExit(f"ended with {exit_codes}: {messages}")
 

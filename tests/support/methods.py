@@ -224,9 +224,9 @@ class InvalidActionControl(ParityControl):
         return NUM_ACTIONS + choice * ROTATE_RIGHT, state
 
 
-BATCH = Method(BatchMean)
-WIDTH = Method(WrongWidth)
-FINITE = Method(NotFinite)
-NOTE = Method(Reading, tracker=DtypeChangingTracker())
-ACTION = Method(Reading, tracker=CountingTracker(), control=InvalidActionControl())
+BATCH_DEPENDENT = Method(BatchMean)
+WRONG_WIDTH = Method(WrongWidth)
+NOT_FINITE = Method(NotFinite)
+DTYPE_CHANGING = Method(Reading, tracker=DtypeChangingTracker())
+INVALID_ACTION = Method(Reading, tracker=CountingTracker(), control=InvalidActionControl())
 NO_METHOD = nnx.Module

@@ -9,7 +9,7 @@ from pathlib import Path
 REPOSITORY = Path(__file__).parents[2]
 
 
-def run(command, **environment):
+def start_python(command, **environment):
     """Start Python with the words of a command and additional environment variables; its output is piped."""
     variables = {name: str(value) for name, value in environment.items()}
     return subprocess.Popen(
@@ -29,7 +29,7 @@ def free_address():
         return f"127.0.0.1:{probe.getsockname()[1]}"
 
 
-def start(address, index, config_file, run_dir, *options, **environment):
+def start_training_process(address, index, config_file, run_dir, *options, **environment):
     """Start one of two processes on this machine that train one run.
 
     Args:
@@ -46,10 +46,10 @@ def start(address, index, config_file, run_dir, *options, **environment):
     # The processes have one device each, whatever number of devices the tests have.
     xla_flags = [flag for flag in os.environ.get("XLA_FLAGS", "").split() if "device_count" not in flag]
     environment |= {"JAX_COORDINATOR_BIND_ADDRESS": address, "XLA_FLAGS": " ".join(xla_flags)}
-    return run([*command, devices, *options], **environment)
+    return start_python([*command, devices, *options], **environment)
 
 
-def ends(*processes, timeout=600):
+def wait_for_processes(*processes, timeout=600):
     """Wait for processes, and return their exit codes and what they wrote to stderr."""
     try:
         messages = [process.communicate(timeout=timeout)[1] for process in processes]

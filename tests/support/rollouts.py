@@ -19,7 +19,7 @@ SLOTS = 20  # environments that the plain loop repeats
 ENV, PARAMS = tiny.world()
 KNOWLEDGE = tiny.knowledge()
 PRIORS = KNOWLEDGE.priors
-ACTING = AgentLoop(ENV, tiny.SPEC, tiny.ESTIMATOR)
+AGENT_LOOP = AgentLoop(ENV, tiny.SPEC, tiny.ESTIMATOR)
 CONFIG = PPOConfig(
     num_envs=ENVS,
     rollout=LENGTH,
@@ -34,7 +34,7 @@ CONFIG = PPOConfig(
     max_grad_norm=0.5,
     distil=0.02,
 )
-LEARNER = Learner(agent_loop=ACTING, config=CONFIG, counterfactual="distil")
+LEARNER = Learner(agent_loop=AGENT_LOOP, config=CONFIG, counterfactual="distil")
 ROWS = tiny.BANK.rows
 SUCCESSOR = tiny.BANK.successor
 #: Scene of each pose.
@@ -42,23 +42,55 @@ SCENE = np.repeat([0, 1], tiny.BANK.num_cells * tiny.POSES_PER_CELL)
 
 
 @functools.partial(jax.jit, static_argnums=(3, 4))
-def act(weights, agent, key, use_coin, agent_loop=ACTING):
-    """The agent after a rollout, and the rollout."""
+def collect(weights, agent, key, mask_direct, agent_loop=AGENT_LOOP):
+    """The agent after a rollout, and the rollout; with `mask_direct` steps have no direct pathways at random."""
     policy = agent_loop.bind(weights)
-    return collect_rollout(agent_loop, policy, agent, key, PARAMS, KNOWLEDGE, num_steps=LENGTH, use_coin=use_coin)
+    return collect_rollout(agent_loop, policy, agent, key, PARAMS, KNOWLEDGE, num_steps=LENGTH, use_coin=mask_direct)
+
+
+def collect_rollouts(agent_loop, weights, seeds, knowledge=KNOWLEDGE, first_agent: Any = None, **options):
+    """Rollouts that continue one another, so that all but the first begin within episodes.
+
+    Args:
+      agent_loop: runs the agents.
+      weights: parameters of the policy.
+      seeds: seeds of the rollouts, one each.
+      knowledge: knowledge from before training.
+      first_agent: `Agent` before the first rollout; None for new episodes in all environments.
+      **options: further options of `jaxnav.training.ppo.collect_rollout`.
+
+    Returns:
+      The agents before the first and after each rollout, and the rollouts.
+    """
+
+    @jax.jit
+    def collect_one(agent, key):
+        policy = agent_loop.bind(weights)
+        return collect_rollout(agent_loop, policy, agent, key, PARAMS, knowledge, num_steps=LENGTH, **options)
+
+    if first_agent is None:
+        memory = agent_loop.bind(weights).initial_memory((ENVS,))
+        first_agent = agent_loop.start(jax.random.key(0), ENVS, memory, knowledge, PARAMS)
+    agents = [first_agent]
+    rollouts = []
+    for seed in seeds:
+        agent, rollout = collect_one(agents[-1], jax.random.key(seed))
+        agents.append(agent)
+        rollouts.append(rollout)
+    return agents, rollouts
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def begin(key, agent_loop=ACTING):
+def start_agents(key, agent_loop=AGENT_LOOP):
     """The agent at the start of an episode in every environment."""
     memory = agent_loop.bind(tiny.random_params(0)).initial_memory((ENVS,))
     return agent_loop.start(key, ENVS, memory, KNOWLEDGE, PARAMS)
 
 
 @jax.jit
-def decide_again(weights, transitions, memory):
+def replay_decisions(weights, transitions, memory):
     """The factual and the counterfactual decisions of recorded transitions."""
-    replayed = replay_rollout(ACTING.bind(weights), transitions, memory, PARAMS)
+    replayed = replay_rollout(AGENT_LOOP.bind(weights), transitions, memory, PARAMS)
     return replayed.factual, replayed.counterfactual
 
 
@@ -100,12 +132,12 @@ class RecordedRollout(NamedTuple):
 
 
 @functools.cache
-def rolled(use_coin: bool) -> RecordedRollout:
-    """The second of two rollouts; with coins, each step has no direct pathways with probability 1/2."""
+def record_rollout(mask_direct: bool) -> RecordedRollout:
+    """The second of two rollouts; with `mask_direct`, each step has no direct pathways with probability 1/2."""
     weights = tiny.random_params(5)
     key = jax.random.key(1)
-    agent, _ = act(weights, begin(jax.random.key(0)), jax.random.fold_in(key, 0), use_coin)
-    last_agent, rollout = act(weights, agent, jax.random.fold_in(key, 1), use_coin)
+    agent, _ = collect(weights, start_agents(jax.random.key(0)), jax.random.fold_in(key, 0), mask_direct)
+    last_agent, rollout = collect(weights, agent, jax.random.fold_in(key, 1), mask_direct)
     return jax.tree.map(np.asarray, RecordedRollout(weights, agent, last_agent, *rollout))
 
 
@@ -130,9 +162,9 @@ class PlainLoopResults(NamedTuple):
 
 
 @functools.cache
-def retrace(use_coin: bool) -> PlainLoopResults:
+def run_plain_loop(mask_direct: bool) -> PlainLoopResults:
     """Walk along the recorded actions, one slot (environment) after the other."""
-    recording = rolled(use_coin)
+    recording = record_rollout(mask_direct)
     results = PlainLoopResults(
         layout_weights=np.zeros((LENGTH, SLOTS, len(tiny.CATEGORIES)), np.float32),
         value=np.zeros((LENGTH, SLOTS), np.float32),
@@ -142,7 +174,7 @@ def retrace(use_coin: bool) -> PlainLoopResults:
         memory=[],
     )
     for slot in range(SLOTS):
-        _retrace_slot(recording, results, slot)
+        _run_slot(recording, results, slot)
 
     # Within an episode the next value is that of the next step, or that of the agent after the rollout.
     last_state = recording.after.state
@@ -157,7 +189,7 @@ def retrace(use_coin: bool) -> PlainLoopResults:
     return results
 
 
-def _retrace_slot(recording: RecordedRollout, results: PlainLoopResults, slot: int) -> None:
+def _run_slot(recording: RecordedRollout, results: PlainLoopResults, slot: int) -> None:
     """Fill a column of the results, and append the last belief and memory."""
     layout = tiny.leaves_at(recording.before.perception.layout, slot)
     memory = tiny.leaves_at(recording.before.memory, slot)

@@ -11,13 +11,13 @@ from jaxnav.scenes.tables.observation_row import RowFormat
 from jaxnav.scenes.task import Task
 from support.scenes import BOOK, CATEGORIES, CHAIR, FRIDGE
 
-K = len(CATEGORIES)
+NUM_CATEGORIES = len(CATEGORIES)
 TASK = Task(CATEGORIES)
-PER_CELL = TASK.rules.poses_per_cell
+POSES_PER_CELL = TASK.rules.poses_per_cell
 EAST, WEST = 2, 6  # headings
 ROOMS = [prior_index(room) for room in ("kitchen", "bedroom")]
-KITCHEN, BEDROOM = ROOMS
-NOTHING = np.zeros((NUM_PRIORS, K, K))
+KITCHEN_PRIOR, BEDROOM_PRIOR = ROOMS
+NO_COUNTS = np.zeros((NUM_PRIORS, NUM_CATEGORIES, NUM_CATEGORIES))
 
 
 def corridor(*shown, room_type="kitchen"):
@@ -29,18 +29,18 @@ def corridor(*shown, room_type="kitchen"):
     ahead[:, WEST] = np.maximum(cells - 1, 0)
 
     # Rows hold one detection each, and a view in which nothing is known.
-    num_poses = len(cells) * PER_CELL
-    detections = np.zeros((num_poses, K, 4), np.uint8)
-    detections[np.arange(num_poses), np.repeat(shown, 3 * PER_CELL), 0] = 255
-    row_format = RowFormat(K)
+    num_poses = len(cells) * POSES_PER_CELL
+    detections = np.zeros((num_poses, NUM_CATEGORIES, 4), np.uint8)
+    detections[np.arange(num_poses), np.repeat(shown, 3 * POSES_PER_CELL), 0] = 255
+    row_format = RowFormat(NUM_CATEGORIES)
     rows = row_format.pack(detections, np.zeros((num_poses, row_format.view, row_format.view), np.uint8))
 
-    best_length = np.ones((num_poses, K), np.uint16)
-    goal_distance = np.ones((len(cells), K), np.float32)
+    best_length = np.ones((num_poses, NUM_CATEGORIES), np.uint16)
+    goal_distance = np.ones((len(cells), NUM_CATEGORIES), np.float32)
     first_cell = np.array([0], np.int32)
     num_cells = np.array([len(cells)], np.int32)
-    goals = np.arange(K, dtype=np.int32)[None]
-    num_goals = np.array([K], np.int32)
+    goals = np.arange(NUM_CATEGORIES, dtype=np.int32)[None]
+    num_goals = np.array([NUM_CATEGORIES], np.int32)
     return Bank(
         TASK,
         ("corridor",),
@@ -57,14 +57,14 @@ def corridor(*shown, room_type="kitchen"):
     )
 
 
-PATH = corridor(BOOK, CHAIR, FRIDGE)
+THREE_ZONE_CORRIDOR = corridor(BOOK, CHAIR, FRIDGE)
 
 
 @functools.cache
-def learned(*banks_of, zones=3):
+def learn_corridor_zones(*corridors, zones=3):
     """Zones of corridors, each given by its categories and its room type."""
-    banks = [corridor(*shown, room_type=room) for shown, room in banks_of]
-    return learn_zones(banks, NOTHING, zones)
+    banks = [corridor(*shown, room_type=room) for shown, room in corridors]
+    return learn_zones(banks, NO_COUNTS, zones)
 
 
 KITCHENS = (((BOOK, CHAIR, FRIDGE), "kitchen"),)
@@ -73,12 +73,12 @@ KITCHENS = (((BOOK, CHAIR, FRIDGE), "kitchen"),)
 def indirect_share(zones, next_zone):
     """Share of the pairs of different zones with poses whose best path leads through another zone."""
     zone = np.arange(zones["nodes"].shape[-2])
-    held = zones["nodes"].max(axis=-1) >= 0
-    pairs = held[:, :, None] & held[:, None, :] & (zone[:, None] != zone)
+    has_poses = zones["nodes"].max(axis=-1) >= 0
+    pairs = has_poses[:, :, None] & has_poses[:, None, :] & (zone[:, None] != zone)
     return (pairs & (next_zone != zone)).sum() / pairs.sum()
 
 
-def holding(zones, category, room=KITCHEN):
+def find_zone_of(zones, category, room=KITCHEN_PRIOR):
     """The zone at which a category is always detected."""
     (zone,) = np.flatnonzero(zones["nodes"][room, :, category] == 1.0)
     return int(zone)

@@ -9,29 +9,30 @@ import numpy as np
 import pytest
 from support import tiny_world as tiny
 from support.rollouts import (
-    ACTING,
+    AGENT_LOOP,
     ENVS,
     KNOWLEDGE,
     LENGTH,
     PARAMS,
     SCENE,
     SLOTS,
-    act,
-    begin,
-    decide_again,
-    retrace,
-    rolled,
+    collect,
+    record_rollout,
+    replay_decisions,
+    run_plain_loop,
+    start_agents,
 )
 
 from jaxnav.scenes.task import DONE
 
-WITH_AND_WITHOUT_COIN = pytest.mark.parametrize("coin", [False, True])
+#: With `mask_direct`, each step has no direct pathways with probability 1/2.
+WITH_AND_WITHOUT_MASKS = pytest.mark.parametrize("mask_direct", [False, True])
 
 
 @pytest.mark.slow
 def test_the_recorded_rollout_contains_every_case():
-    """The comparisons below need terminated and truncated episodes, both scenes and both values of the coin."""
-    recorded = rolled(False)
+    """The comparisons below need terminated and truncated episodes, both scenes, and masked direct pathways."""
+    recorded = record_rollout(False)
     transitions = jax.tree.map(lambda leaf: leaf[:, :SLOTS], recorded.transitions)
     assert transitions.terminated.sum() > 4
     assert transitions.truncated.sum() > 5
@@ -39,24 +40,24 @@ def test_the_recorded_rollout_contains_every_case():
     assert transitions.truncated[-1].any()
     assert (recorded.before.state.time > 0).any()
     assert len(np.unique(SCENE[transitions.pose])) == 2
-    assert rolled(True).transitions.use_direct.mean() == pytest.approx(0.5, abs=0.2)
+    assert record_rollout(True).transitions.use_direct.mean() == pytest.approx(0.5, abs=0.2)
     assert transitions.use_direct is None
 
 
 @pytest.mark.slow
-@WITH_AND_WITHOUT_COIN
-def test_weights_values_and_probabilities_equal_those_of_a_plain_loop(coin):
-    transitions = rolled(coin).transitions
-    plain_loop = retrace(coin)
+@WITH_AND_WITHOUT_MASKS
+def test_weights_values_and_probabilities_equal_those_of_a_plain_loop(mask_direct):
+    transitions = record_rollout(mask_direct).transitions
+    plain_loop = run_plain_loop(mask_direct)
     for name in ("layout_weights", "value", "log_prob"):
         result = getattr(transitions, name)[:, :SLOTS]
         np.testing.assert_allclose(result, getattr(plain_loop, name), rtol=1e-4, atol=1e-5, err_msg=name)
 
 
-@WITH_AND_WITHOUT_COIN
-def test_next_value_is_that_of_the_cut_state_at_a_limit_and_zero_after_done(coin):
-    recorded = rolled(coin)
-    plain_loop = retrace(coin)
+@WITH_AND_WITHOUT_MASKS
+def test_next_value_is_that_of_the_cut_state_at_a_limit_and_zero_after_done(mask_direct):
+    recorded = record_rollout(mask_direct)
+    plain_loop = run_plain_loop(mask_direct)
     np.testing.assert_allclose(recorded.next_value[:, :SLOTS], plain_loop.next_value, rtol=1e-4, atol=1e-5)
     np.testing.assert_array_equal(recorded.next_value[recorded.transitions.terminated], 0)
     # The value of a cut state differs from the value at the start of the next episode.
@@ -65,10 +66,10 @@ def test_next_value_is_that_of_the_cut_state_at_a_limit_and_zero_after_done(coin
     assert np.abs(value_changes).max() > 0.01
 
 
-@WITH_AND_WITHOUT_COIN
-def test_the_agent_after_the_rollout_equals_that_of_the_plain_loop(coin):
-    last_agent = rolled(coin).after
-    plain_loop = retrace(coin)
+@WITH_AND_WITHOUT_MASKS
+def test_the_agent_after_the_rollout_equals_that_of_the_plain_loop(mask_direct):
+    last_agent = record_rollout(mask_direct).after
+    plain_loop = run_plain_loop(mask_direct)
     for slot in range(SLOTS):
         memory = tiny.leaves_at(last_agent.memory, slot)
         layout = tiny.leaves_at(last_agent.perception.layout, slot)
@@ -76,10 +77,10 @@ def test_the_agent_after_the_rollout_equals_that_of_the_plain_loop(coin):
         chex.assert_trees_all_close(layout, plain_loop.layout[slot], rtol=1e-5)
 
 
-@WITH_AND_WITHOUT_COIN
-def test_replay_repeats_the_recorded_decisions(coin):
-    recorded = rolled(coin)
-    decisions, _ = decide_again(recorded.weights, recorded.transitions, recorded.memory)
+@WITH_AND_WITHOUT_MASKS
+def test_replay_repeats_the_recorded_decisions(mask_direct):
+    recorded = record_rollout(mask_direct)
+    decisions, _ = replay_decisions(recorded.weights, recorded.transitions, recorded.memory)
     log_probs = np.asarray(jax.nn.log_softmax(decisions.logits))
     action_log_prob = np.take_along_axis(log_probs, recorded.transitions.action[..., None], axis=-1)
     np.testing.assert_allclose(action_log_prob[..., 0], recorded.transitions.log_prob, rtol=1e-4, atol=1e-5)
@@ -87,7 +88,7 @@ def test_replay_repeats_the_recorded_decisions(coin):
 
 
 def test_rewards_and_lengths_follow_the_tables():
-    transitions = rolled(False).transitions
+    transitions = record_rollout(False).transitions
     can_succeed = (tiny.BANK.best_length == 1)[transitions.pose, transitions.goal]
     np.testing.assert_array_equal(transitions.terminated, transitions.action == DONE)
     np.testing.assert_array_equal(transitions.success, transitions.terminated & can_succeed)
@@ -101,7 +102,7 @@ def test_rewards_and_lengths_follow_the_tables():
 
 
 def test_poses_are_stored_as_integers():
-    transitions = rolled(False).transitions
+    transitions = record_rollout(False).transitions
     chex.assert_type([transitions.pose, transitions.goal, transitions.action, transitions.episode_length], jnp.int32)
     chex.assert_shape([transitions.pose, transitions.value, transitions.reward], (LENGTH, ENVS))
 
@@ -111,10 +112,10 @@ def test_an_episode_slot_is_truncated_at_most_once():
     weights = tiny.random_params(0)
     bias = weights["actor"]["bias"].at[DONE].set(-1e9)
     weights |= {"actor": weights["actor"] | {"bias": bias}}
-    agent = begin(jax.random.key(0))
+    agent = start_agents(jax.random.key(0))
     truncations = []
     for i in range(4):
-        agent, rollout = act(weights, agent, jax.random.key(i), False)
+        agent, rollout = collect(weights, agent, jax.random.key(i), False)
         truncations.append(np.asarray(rollout.transitions.truncated))
         assert not rollout.transitions.terminated.any()
 
@@ -127,22 +128,22 @@ def test_an_episode_slot_is_truncated_at_most_once():
 
 def test_equal_keys_give_equal_rollouts_and_other_keys_do_not():
     weights = tiny.random_params(0)
-    agent = begin(jax.random.key(0))
-    expected = act(weights, agent, jax.random.key(5), False)
-    chex.assert_trees_all_equal(act(weights, agent, jax.random.key(5), False), expected)
-    _, other_rollout = act(weights, agent, jax.random.key(6), False)
+    agent = start_agents(jax.random.key(0))
+    expected = collect(weights, agent, jax.random.key(5), False)
+    chex.assert_trees_all_equal(collect(weights, agent, jax.random.key(5), False), expected)
+    _, other_rollout = collect(weights, agent, jax.random.key(6), False)
     assert (other_rollout.transitions.action != expected[1].transitions.action).any()
 
 
 def test_without_an_estimator_there_is_no_layout_and_its_weights_are_ones():
-    agent_loop = dataclasses.replace(ACTING, estimator_config=None)
+    agent_loop = dataclasses.replace(AGENT_LOOP, estimator_config=None)
     key = jax.random.key(0)
 
-    def collect():
-        return act(tiny.random_params(0), begin(key, agent_loop), key, False, agent_loop)
+    def start_and_collect():
+        return collect(tiny.random_params(0), start_agents(key, agent_loop), key, False, agent_loop)
 
-    agent, rollout = jax.eval_shape(collect)
+    agent, rollout = jax.eval_shape(start_and_collect)
     assert agent.perception.layout is None
     assert rollout.transitions.layout_weights.shape == (LENGTH, ENVS, 3)
-    layout_weights = agent_loop.policy_inputs(begin(key, agent_loop), KNOWLEDGE, PARAMS).layout_weights
+    layout_weights = agent_loop.policy_inputs(start_agents(key, agent_loop), KNOWLEDGE, PARAMS).layout_weights
     np.testing.assert_array_equal(layout_weights, np.ones((ENVS, 3)))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import tiny_world as tiny
-from support.rollouts import ENV, ENVS, KNOWLEDGE, LENGTH, PARAMS, changed_parts
+from support.rollouts import ENV, ENVS, KNOWLEDGE, LENGTH, PARAMS, changed_parts, collect_rollouts
 
 from jaxnav.causal import do
 from jaxnav.policies.agent_loop import AgentLoop
@@ -123,18 +123,8 @@ def collect_two_rollouts(method_name, counterfactual_memory="own"):
     )
     agent_loop = AgentLoop(ENV, spec, tiny.ESTIMATOR)
     weights = tiny.random_params(3, spec)
-    policy = agent_loop.bind(weights)
-
-    @jax.jit
-    def collect(agent, key):
-        return ppo.collect_rollout(agent_loop, policy, agent, key, PARAMS, KNOWLEDGE, num_steps=LENGTH)
-
-    agent = agent_loop.start(jax.random.key(0), ENVS, policy.initial_memory((ENVS,)), KNOWLEDGE, PARAMS)
-    rollouts = []
-    for number in range(2):
-        agent, rollout = collect(agent, jax.random.key(number))
-        rollouts.append(rollout)
-    return agent_loop, weights, rollouts, agent
+    agents, rollouts = collect_rollouts(agent_loop, weights, seeds=range(2))
+    return agent_loop, weights, rollouts, agents[-1]
 
 
 def replay_as(replay_decisions: Any, agent_loop: AgentLoop, weights: Any, rollout: Any) -> Any:

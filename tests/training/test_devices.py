@@ -7,7 +7,7 @@ import os
 import numpy as np
 import pytest
 from support.commands import refusal, train
-from support.processes import REPOSITORY, run
+from support.processes import REPOSITORY, start_python
 from support.tiers import params_by_tier
 from support.tiny_run import write_config
 
@@ -83,7 +83,9 @@ def train_on_devices(*device_counts):
     """Policies of one run for each number of devices, by this number as a string."""
     path = os.pathsep.join([str(REPOSITORY), str(REPOSITORY / "tests")])
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=4"
-    process = run(["-c", TRAINING_PROGRAM, *device_counts], PYTHONPATH=path, XLA_FLAGS=flags, JAX_PLATFORMS="cpu")
+    process = start_python(
+        ["-c", TRAINING_PROGRAM, *device_counts], PYTHONPATH=path, XLA_FLAGS=flags, JAX_PLATFORMS="cpu"
+    )
     output, error = process.communicate(timeout=200)
     assert process.returncode == 0, error
     return json.loads(output)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import tiny_world as tiny
-from support.rollouts import ENV, ENVS, KNOWLEDGE, LENGTH, PARAMS, choice_log_probs
+from support.rollouts import ENV, ENVS, KNOWLEDGE, LENGTH, PARAMS, choice_log_probs, collect_rollouts
 
 from jaxnav.causal import do
 from jaxnav.policies.agent_loop import AgentLoop
@@ -18,7 +18,7 @@ from jaxnav.policies.methods import find_method
 from jaxnav.policies.network import bind
 from jaxnav.runs.config import RunConfig, check_config
 from jaxnav.training.config import PPOConfig
-from jaxnav.training.ppo import Learner, collect_rollout, replay_rollout
+from jaxnav.training.ppo import Learner, replay_rollout
 
 EXPERIENCE_PROB = 0.7
 NUM_ROLLOUTS = 3
@@ -38,51 +38,42 @@ def make_loop(method_name):
 
 
 @functools.cache
-def collect_rollouts(method_name):
+def collect_dropout_rollouts(method_name):
     """The weights of a policy, and rollouts that continue one another; transitions have leaves [LENGTH, ENVS, ...]."""
     agent_loop = make_loop(method_name)
     config = PPOConfig(num_envs=ENVS, rollout=LENGTH, minibatches=4, experience=EXPERIENCE_PROB)
     weights = tiny.random_params(3, make_spec(method_name))
-
-    @jax.jit
-    def collect(agent, key):
-        policy = agent_loop.bind(weights)
-        return collect_rollout(
-            agent_loop, policy, agent, key, PARAMS, KNOWLEDGE, num_steps=LENGTH, experience_prob=EXPERIENCE_PROB
-        )
-
-    agent = jax.jit(Learner(agent_loop, config, "none").init)(jax.random.key(0), PARAMS, KNOWLEDGE).agent
-    rollouts = []
-    for number in range(NUM_ROLLOUTS):
-        agent, rollout = collect(agent, jax.random.key(number))
-        rollouts.append(rollout)
+    first_state = jax.jit(Learner(agent_loop, config, "none").init)(jax.random.key(0), PARAMS, KNOWLEDGE)
+    _, rollouts = collect_rollouts(
+        agent_loop, weights, range(NUM_ROLLOUTS), first_agent=first_state.agent, experience_prob=EXPERIENCE_PROB
+    )
     return weights, rollouts
 
 
 @pytest.mark.slow
 def test_dropout_draws_whole_episodes():
-    _, rollouts = collect_rollouts("org")
-    flags = np.concatenate([rollout.transitions.use_experience for rollout in rollouts])
+    _, rollouts = collect_dropout_rollouts("org")
+    use_experience = np.concatenate([rollout.transitions.use_experience for rollout in rollouts])
     ended = np.concatenate([rollout.transitions.ended for rollout in rollouts])
-    has_changed = flags[1:] != flags[:-1]
-    assert set(np.unique(flags)) == {0, 1}
+    has_changed = use_experience[1:] != use_experience[:-1]
+    assert set(np.unique(use_experience)) == {0, 1}
     assert not has_changed[~ended[:-1]].any()
     assert has_changed[ended[:-1]].any()
     for rollout, next_rollout in itertools.pairwise(rollouts):
         is_running = ~rollout.transitions.ended[-1]
-        last_flags = rollout.transitions.use_experience[-1]
-        np.testing.assert_array_equal(next_rollout.initial_memory.use_experience[is_running], last_flags[is_running])
+        expected = rollout.transitions.use_experience[-1]
+        np.testing.assert_array_equal(next_rollout.initial_memory.use_experience[is_running], expected[is_running])
 
     # Of about 230 episodes, a share of 0.7 has experience: three standard deviations are 0.09.
     is_first = np.concatenate([np.ones_like(ended[:1]), ended[:-1]])
     assert is_first.sum() > 200
-    assert flags[is_first].mean() == pytest.approx(EXPERIENCE_PROB, abs=0.09)
+    assert use_experience[is_first].mean() == pytest.approx(EXPERIENCE_PROB, abs=0.09)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method_name", HOSTS)
 def test_replay_recomputes_log_probs_and_values(method_name):
-    weights, rollouts = collect_rollouts(method_name)
+    weights, rollouts = collect_dropout_rollouts(method_name)
     agent_loop = make_loop(method_name)
 
     @jax.jit

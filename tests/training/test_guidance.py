@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 from support import tiny_world as tiny
-from support.rollouts import ACTING, CONFIG, LEARNER, PARAMS, rolled
+from support.rollouts import AGENT_LOOP, CONFIG, LEARNER, PARAMS, record_rollout
 
 from jaxnav.env.make import build_environment
 from jaxnav.errors import InputError
@@ -31,11 +31,11 @@ def guided_ppo(**settings):
 
 def loss_terms(config, env_params):
     """The loss of a recorded rollout, its terms by name, and the factual logits."""
-    recorded = rolled(False)
+    recorded = record_rollout(False)
     transitions, memory = jax.tree.map(jnp.asarray, (recorded.transitions, recorded.memory))
 
     def compute(weights):
-        replay = replay_rollout(ACTING.bind(weights), transitions, memory, env_params)
+        replay = replay_rollout(AGENT_LOOP.bind(weights), transitions, memory, env_params)
         return *ppo_loss(replay, transitions.reward, config.scalars(10), False, METHOD), replay.factual.logits
 
     return jax.tree.map(np.asarray, jax.jit(compute)(recorded.weights))
@@ -47,7 +47,7 @@ def test_guidance_adds_the_weighted_cross_entropy_to_shortest_paths():
     plain_loss, plain_terms, _ = loss_terms(CONFIG, PARAMS)
 
     # Step by step: minus the log-probability of the action that the table of shortest paths holds.
-    transitions = rolled(False).transitions
+    transitions = record_rollout(False).transitions
     expert = tiny.BANK.expert
     cross_entropies = []
     for time, env in np.ndindex(transitions.pose.shape):
@@ -116,11 +116,20 @@ def test_the_default_weight_is_that_of_the_world_if_the_method_chooses_actions(w
     assert fill_world_defaults(RunConfig(world=world)).ppo.guidance == WORLDS[world].guidance
 
 
-def test_an_explicit_weight_is_used_and_a_positive_weight_needs_guidance():
+def test_explicit_guidance_weight_overrides_the_default_of_the_world():
     config = check_config(RunConfig(ppo=PPOConfig(guidance=0.25)))
     assert config.ppo.guidance == 0.25
+
+
+def test_has_guidance_if_the_first_or_final_weight_is_positive():
+    assert PPOConfig(guidance=0.1, final_guidance=0.0).has_guidance
     assert not PPOConfig(guidance=0.0).has_guidance
     assert PPOConfig(guidance=0.0, final_guidance=0.1).has_guidance
+
+
+def test_guidance_can_rise_from_zero():
+    scalars = PPOConfig(final_guidance=0.1).scalars(num_updates=3)
+    assert (scalars.guidance_weight, scalars.final_guidance_weight) == (0.0, pytest.approx(0.1))
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import tiny_world as tiny
-from support.rollouts import ACTING, CONFIG, KNOWLEDGE, LEARNER, PARAMS, act
+from support.rollouts import AGENT_LOOP, CONFIG, KNOWLEDGE, LEARNER, PARAMS, collect
 
 from jaxnav.policies.agent_loop import AgentLoop
 from jaxnav.policies.method import Knowledge
@@ -146,7 +146,7 @@ def test_episode_statistics_are_those_of_the_episodes_that_ended(initial_states,
     """The statistics of one update equal a recount over the rollout of this update."""
     state = tiny.leaves_at(initial_states, 0)
     rollout_key = jax.random.fold_in(jax.random.fold_in(state.key, state.update), 0)
-    transitions = jax.tree.map(np.asarray, act(state.params, state.agent, rollout_key, False)[1].transitions)
+    transitions = jax.tree.map(np.asarray, collect(state.params, state.agent, rollout_key, False)[1].transitions)
     metrics = {name: float(value[0]) for name, value in first_update[1].items()}
     has_ended = transitions.terminated | transitions.truncated
     assert metrics["episodes"] == has_ended.sum() > 20
@@ -227,7 +227,7 @@ def test_minibatches_differ_between_epochs():
 @pytest.mark.slow
 def test_a_method_without_experience_trains():
     spec = dataclasses.replace(tiny.SPEC, method=find_method("rgb"))
-    learner = dataclasses.replace(LEARNER, agent_loop=AgentLoop(ACTING.env, spec))
+    learner = dataclasses.replace(LEARNER, agent_loop=AgentLoop(AGENT_LOOP.env, spec))
     state = learner.init(jax.random.key(0), PARAMS, KNOWLEDGE)
     next_state, metrics = jax.jit(learner.update)(state, SCALARS, PARAMS, KNOWLEDGE)
     chex.assert_tree_all_finite((next_state.params, metrics))

@@ -1,6 +1,5 @@
 """Advantages by hand and in NumPy; the PPO loss in NumPy; which parameters the counterfactual branch's loss reaches."""
 
-import dataclasses
 import functools
 from typing import NamedTuple
 
@@ -12,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support import tiny_world as tiny
-from support.rollouts import ACTING, ENVS, LENGTH, PARAMS, ROWS, changed_parts, decide_again, rolled
+from support.rollouts import AGENT_LOOP, ENVS, LENGTH, PARAMS, ROWS, changed_parts, record_rollout, replay_decisions
 
 from jaxnav.policies.methods import METHODS
 from jaxnav.policies.pathways import NO_ACTION, Pathways, PolicyState
@@ -170,8 +169,8 @@ def make_scalars(**changes) -> PPOScalars:
 
 @functools.partial(jax.jit, static_argnums=3)
 def loss_on_rollout(weights, advantage, scalars, distil):
-    run = rolled(True)
-    replayed = replay_rollout(ACTING.bind(weights), run.transitions, run.memory, PARAMS)
+    run = record_rollout(True)
+    replayed = replay_rollout(AGENT_LOOP.bind(weights), run.transitions, run.memory, PARAMS)
     return ppo_loss(replayed, advantage, scalars, distil, METHODS["org"])
 
 
@@ -210,8 +209,8 @@ def loss_parts_in_numpy(factual, counterfactual, transitions, advantage):
 @pytest.mark.slow
 @pytest.mark.parametrize("distil", [False, True])
 def test_ppo_loss_equals_the_clipped_loss_in_numpy(distil):
-    run = rolled(True)
-    decisions = decide_again(NEW_WEIGHTS, run.transitions, run.memory)
+    run = record_rollout(True)
+    decisions = replay_decisions(NEW_WEIGHTS, run.transitions, run.memory)
     factual, counterfactual = jax.tree.map(np.asarray, decisions)
     expected_parts = loss_parts_in_numpy(factual, counterfactual, run.transitions, RANDOM_ADVANTAGE)
     expected_total = (
@@ -232,20 +231,8 @@ def test_ppo_loss_equals_the_clipped_loss_in_numpy(distil):
 
 def test_policy_loss_of_the_acting_policy_is_zero():
     # All ratios are 1, so the policy loss is minus the mean of the scaled advantages: 0.
-    _, parts = loss_on_rollout(rolled(True).weights, RANDOM_ADVANTAGE, make_scalars(), False)
+    _, parts = loss_on_rollout(record_rollout(True).weights, RANDOM_ADVANTAGE, make_scalars(), False)
     assert parts["policy_loss"] == pytest.approx(0, abs=1e-5)
-
-
-@pytest.mark.slow
-def test_ppo_loss_adds_the_auxiliary_loss_of_the_method():
-    run = rolled(True)
-    metrics = {"extra_metric": jnp.float32(3)}
-    method = dataclasses.replace(METHODS["org"], auxiliary=lambda replayed: (jnp.float32(0.25), metrics))
-    replayed = replay_rollout(ACTING.bind(NEW_WEIGHTS), run.transitions, run.memory, PARAMS)
-    plain_loss, plain_parts = loss_on_rollout(NEW_WEIGHTS, RANDOM_ADVANTAGE, make_scalars(), False)
-    total_loss, total_parts = ppo_loss(replayed, jnp.asarray(RANDOM_ADVANTAGE), make_scalars(), False, method)
-    assert total_loss == pytest.approx(float(plain_loss) + 0.25, rel=1e-5)
-    assert total_parts.keys() - plain_parts.keys() == {"extra_metric"}
 
 
 # The counterfactual branch
@@ -277,7 +264,7 @@ def test_distillation_gradient_reaches_only_the_counterfactual_branch():
 @pytest.mark.slow
 def test_distillation_gradient_is_that_of_kl_to_a_fixed_target_with_fixed_memories():
     """Neither the factual logits nor the memories have a part in the gradient."""
-    run = rolled(True)
+    run = record_rollout(True)
     slot = 1
     transitions = tiny.leaves_at(run.transitions, slice(None), slot)
     rows = ROWS[transitions.pose]
@@ -309,7 +296,7 @@ def test_distillation_gradient_is_that_of_kl_to_a_fixed_target_with_fixed_memori
     def distil_loss(weights):
         slot_transitions = jax.tree.map(lambda leaf: leaf[:, None], transitions)
         slot_memory = jax.tree.map(lambda leaf: leaf[[slot]], run.memory)
-        replayed = replay_rollout(ACTING.bind(weights), slot_transitions, slot_memory, PARAMS)
+        replayed = replay_rollout(AGENT_LOOP.bind(weights), slot_transitions, slot_memory, PARAMS)
         total, _ = ppo_loss(replayed, jnp.zeros((LENGTH, 1)), make_scalars(**DISTIL_ONLY), True, METHODS["org"])
         return total
 

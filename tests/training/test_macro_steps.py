@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import tiny_world as tiny
-from support.rollouts import ACTING, ENVS, LENGTH, PARAMS, rolled
+from support.rollouts import AGENT_LOOP, ENVS, LENGTH, PARAMS, record_rollout
 from support.scenes import CATEGORIES, corridor_scene
 
 from jaxnav.env.make import build_environment
@@ -30,7 +30,7 @@ LIMIT = 26
 @pytest.mark.slow
 def test_steps_without_a_decision_do_not_train_the_policy():
     """Choices and advantages of steps without a decision change no gradient; only the value learns from all steps."""
-    recorded = rolled(False)
+    recorded = record_rollout(False)
     is_decision = jnp.asarray(np.random.default_rng(0).random((LENGTH, ENVS)) < 0.3)
     advantage = np.random.default_rng(1).normal(size=(LENGTH, ENVS)).astype(np.float32)
     transitions = jax.tree.map(jnp.asarray, recorded.transitions)._replace(is_decision_step=is_decision)
@@ -38,7 +38,7 @@ def test_steps_without_a_decision_do_not_train_the_policy():
     @jax.jit
     def loss_and_gradient(weights, transitions, advantage):
         def policy_loss(weights):
-            replay = replay_rollout(ACTING.bind(weights), transitions, recorded.memory, PARAMS)
+            replay = replay_rollout(AGENT_LOOP.bind(weights), transitions, recorded.memory, PARAMS)
             return ppo_loss(replay, advantage, PPOConfig(value=0.0).scalars(1), True, SEMEXP)[0]
 
         return jax.value_and_grad(policy_loss)(weights)

@@ -11,7 +11,7 @@ from pathlib import Path
 import chex
 import pytest
 from support.commands import evaluate, train
-from support.processes import REPOSITORY, ends, free_address, start
+from support.processes import REPOSITORY, free_address, start_training_process, wait_for_processes
 from support.tiny_run import write_config
 
 from jaxnav.store.export import load_params
@@ -26,8 +26,8 @@ def two_processes(config_file, run_dir, *options):
     options_by_process = options or ((), ())
     processes = []
     for index in range(2):
-        processes.append(start(address, index, config_file, run_dir, *options_by_process[index]))
-    return ends(*processes)
+        processes.append(start_training_process(address, index, config_file, run_dir, *options_by_process[index]))
+    return wait_for_processes(*processes)
 
 
 def assert_loss_is_reported(code, message):
@@ -133,14 +133,14 @@ def test_a_killed_process_ends_the_other_process(victim, checkpoint_pattern, tmp
     step_options = "--total-steps", 60 * 16 * 8  # 60 updates of 16 environments and 8 steps
 
     # Kill one process as soon as the checkpoint of update 4 exists or is being written.
-    processes = [start(address, index, config_file, run_dir, *step_options) for index in range(2)]
+    processes = [start_training_process(address, index, config_file, run_dir, *step_options) for index in range(2)]
     while not list((run_dir / "checkpoints").glob(checkpoint_pattern)) and processes[0].poll() is None:
         time.sleep(0.01)
     processes[victim].kill()
     processes[victim].communicate()
 
     # The other process ends with a message, and the run can be resumed.
-    (code,), (message,) = ends(processes[1 - victim], timeout=300)
+    (code,), (message,) = wait_for_processes(processes[1 - victim], timeout=300)
     assert_loss_is_reported(code, message)
     assert train(config_file, run_dir, "--seeds", 1, *step_options) == 0
     assert re.search(r"resumed after update \d+ of 60", capsys.readouterr().err)
@@ -150,8 +150,8 @@ def test_a_killed_process_ends_the_other_process(victim, checkpoint_pattern, tmp
 def test_a_process_ends_if_the_other_process_never_joins(tmp_path):
     config_file = write_config(tmp_path)
     # Each process waits at an address of its own.
-    processes = [start(free_address(), index, config_file, tmp_path / "run") for index in range(2)]
-    for code, message in zip(*ends(*processes, timeout=300), strict=True):
+    processes = [start_training_process(free_address(), index, config_file, tmp_path / "run") for index in range(2)]
+    for code, message in zip(*wait_for_processes(*processes, timeout=300), strict=True):
         assert_loss_is_reported(code, message)
     assert not (tmp_path / "run").exists()
 

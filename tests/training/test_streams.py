@@ -1,4 +1,4 @@
-"""Training in two streams: the experience coin, the stages, replay, and which stream a gradient reaches."""
+"""Training in two streams: experience dropout, the stages, replay, and which stream a gradient reaches."""
 
 import dataclasses
 import functools
@@ -9,16 +9,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import tiny_world as tiny
-from support.rollouts import ENV, ENVS, KNOWLEDGE, LENGTH, PARAMS, changed_parts, choice_log_probs
+from support.rollouts import ENV, ENVS, KNOWLEDGE, LENGTH, PARAMS, changed_parts, choice_log_probs, collect_rollouts
 
 from jaxnav.policies.agent_loop import AgentLoop
 from jaxnav.policies.methods import find_method
 from jaxnav.runs.config import RunConfig, check_config
 from jaxnav.training.config import PPOConfig
-from jaxnav.training.ppo import Learner, collect_rollout, ppo_loss, replay_rollout
+from jaxnav.training.ppo import Learner, ppo_loss, replay_rollout
 from jaxnav.training.trainer import Trainer
 
 EXPERIENCE_PROB = 0.7
+#: Steps of all environments in an update by the default settings.
+STEPS_PER_UPDATE = PPOConfig().num_envs * PPOConfig().rollout
+#: Steps of 10 chunks of 2 updates.
+TOTAL_STEPS = 10 * 2 * STEPS_PER_UPDATE
 NUM_ROLLOUTS = 3
 #: Replayed in parallel over time; adapting; attending with the memory.
 HOST_PARAMS = [
@@ -42,84 +46,73 @@ def scalars_by_stage(config):
     return config.ppo.stage_scalars(config.stages, config.stage_by_chunk, config.chunk)
 
 
-def make_collect(agent_loop, weights):
-    """A compiled `collect_rollout` of a policy: (agent, key, experience_prob) to the next agent and a rollout."""
-
-    @jax.jit
-    def collect(agent, key, experience_prob):
-        return collect_rollout(
-            agent_loop,
-            agent_loop.bind(weights),
-            agent,
-            key,
-            PARAMS,
-            KNOWLEDGE,
-            num_steps=LENGTH,
-            experience_prob=experience_prob,
-        )
-
-    return collect
-
-
 @functools.cache
-def collect_rollouts(method_name):
+def collect_stream_rollouts(method_name):
     """The weights of a policy, and rollouts that continue one another; transitions have leaves [LENGTH, ENVS, ...]."""
     learner = make_learner(method_name, experience=EXPERIENCE_PROB)
     weights = tiny.random_params(3, make_spec(method_name))
-    collect = make_collect(learner.agent_loop, weights)
-    agent = jax.jit(learner.init)(jax.random.key(0), PARAMS, KNOWLEDGE).agent
-    rollouts = []
-    for number in range(NUM_ROLLOUTS):
-        agent, rollout = collect(agent, jax.random.key(number), jnp.float32(EXPERIENCE_PROB))
-        rollouts.append(rollout)
+    first_state = jax.jit(learner.init)(jax.random.key(0), PARAMS, KNOWLEDGE)
+    _, rollouts = collect_rollouts(
+        learner.agent_loop,
+        weights,
+        range(NUM_ROLLOUTS),
+        first_agent=first_state.agent,
+        experience_prob=jnp.float32(EXPERIENCE_PROB),
+    )
     return weights, rollouts
 
 
-# The coin: whether experience has a part in an episode
+# Experience dropout: whether experience has a part in an episode
 
 
 @pytest.mark.slow
-def test_experience_coin_is_constant_within_an_episode():
-    _, rollouts = collect_rollouts("org")
-    coins = np.concatenate([rollout.transitions.use_experience for rollout in rollouts])
+def test_use_of_experience_is_constant_within_an_episode():
+    _, rollouts = collect_stream_rollouts("org")
+    use_experience = np.concatenate([rollout.transitions.use_experience for rollout in rollouts])
     ended = np.concatenate([rollout.transitions.ended for rollout in rollouts])
-    coin_changed = coins[1:] != coins[:-1]
-    assert set(np.unique(coins)) == {0, 1}
-    assert not coin_changed[~ended[:-1]].any()
+    has_changed = use_experience[1:] != use_experience[:-1]
+    assert set(np.unique(use_experience)) == {0, 1}
+    assert not has_changed[~ended[:-1]].any()
 
-    # Successive episodes have independent coins: two differ with probability 2 p (1 - p).
+    # The draws of successive episodes are independent: two differ with probability 2 p (1 - p).
     expected_share = 2 * EXPERIENCE_PROB * (1 - EXPERIENCE_PROB)
-    assert coin_changed[ended[:-1]].mean() == pytest.approx(expected_share, abs=0.15)
+    assert has_changed[ended[:-1]].mean() == pytest.approx(expected_share, abs=0.15)
 
-    # The memory brings the coin into the next rollout.
+    # The memory brings the draw into the next rollout.
     for rollout, next_rollout in itertools.pairwise(rollouts):
         running = ~rollout.transitions.ended[-1]
-        last_coins = rollout.transitions.use_experience[-1]
-        np.testing.assert_array_equal(next_rollout.initial_memory.use_experience[running], last_coins[running])
+        expected = rollout.transitions.use_experience[-1]
+        np.testing.assert_array_equal(next_rollout.initial_memory.use_experience[running], expected[running])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("experience_prob", [0.25, pytest.param(0.8, marks=pytest.mark.exhaustive)])
-def test_experience_coin_has_the_configured_probability(experience_prob):
+def test_use_of_experience_has_the_configured_probability(experience_prob):
     learner = make_learner("org", experience=experience_prob)
     learner = dataclasses.replace(learner, config=dataclasses.replace(learner.config, num_envs=1024))
 
     # At the first start and at a restart.
     state = jax.jit(learner.init)(jax.random.key(0), PARAMS, KNOWLEDGE)
-    first_coins = state.agent.memory.use_experience
-    restarted_coins = jax.jit(learner.restart_episodes)(state, PARAMS, KNOWLEDGE).agent.memory.use_experience
-    assert first_coins.mean() == pytest.approx(experience_prob, abs=0.05)
-    assert restarted_coins.mean() == pytest.approx(experience_prob, abs=0.05)
-    assert (restarted_coins != first_coins).any()
+    first_use = state.agent.memory.use_experience
+    restarted_use = jax.jit(learner.restart_episodes)(state, PARAMS, KNOWLEDGE).agent.memory.use_experience
+    assert first_use.mean() == pytest.approx(experience_prob, abs=0.05)
+    assert restarted_use.mean() == pytest.approx(experience_prob, abs=0.05)
+    assert (restarted_use != first_use).any()
 
     # In episodes that begin during a rollout.
-    collect = make_collect(learner.agent_loop, tiny.random_params(3, tiny.STREAMS))
-    agent_after, rollout = collect(state.agent, jax.random.key(1), jnp.float32(experience_prob))
-    last_coins = agent_after.memory.use_experience
+    weights = tiny.random_params(3, tiny.STREAMS)
+    agents, (rollout,) = collect_rollouts(
+        learner.agent_loop,
+        weights,
+        seeds=(1,),
+        first_agent=state.agent,
+        experience_prob=jnp.float32(experience_prob),
+    )
+    last_use = agents[-1].memory.use_experience
     is_new_episode = rollout.transitions.ended.any(axis=0)
     assert is_new_episode.sum() > 500
-    assert last_coins[is_new_episode].mean() == pytest.approx(experience_prob, abs=0.06)
-    np.testing.assert_array_equal(last_coins[~is_new_episode], first_coins[~is_new_episode])
+    assert last_use[is_new_episode].mean() == pytest.approx(experience_prob, abs=0.06)
+    np.testing.assert_array_equal(last_use[~is_new_episode], first_use[~is_new_episode])
 
 
 @pytest.mark.parametrize(
@@ -129,18 +122,18 @@ def test_experience_coin_has_the_configured_probability(experience_prob):
         pytest.param("episode", 0.0, marks=pytest.mark.exhaustive),
     ],
 )
-def test_experience_coin_changes_within_an_episode_only_if_drawn_every_step(drawn, expected_share):
+def test_use_of_experience_changes_within_an_episode_only_if_drawn_every_step(drawn, expected_share):
     learner = make_learner("org", experience=0.5, experience_drawn=drawn)
     state = jax.jit(learner.init)(jax.random.key(0), PARAMS, KNOWLEDGE)
-    coins_before = np.asarray(state.agent.memory.use_experience)
+    use_before = np.asarray(state.agent.memory.use_experience)
     scalars = learner.config.scalars(num_updates=1)
     agent_after = jax.jit(learner.update)(state, scalars, PARAMS, KNOWLEDGE)[0].agent
 
     # Where no episode has begun since.
     is_same_episode = np.asarray(agent_after.state.time) == LENGTH
     assert is_same_episode.sum() > ENVS / 4
-    coin_changed = agent_after.memory.use_experience[is_same_episode] != coins_before[is_same_episode]
-    assert coin_changed.mean() == expected_share
+    has_changed = agent_after.memory.use_experience[is_same_episode] != use_before[is_same_episode]
+    assert has_changed.mean() == expected_share
 
 
 # Stages
@@ -177,8 +170,8 @@ def test_trainer_trains_the_direct_stream_alone_and_then_both():
 
     # The second stage changes the experience stream too.
     states = trainer.restart(states, PARAMS, 1)
-    coins = states["layout"][0].agent.memory.use_experience
-    assert coins.mean() == pytest.approx(EXPERIENCE_PROB, abs=0.25)
+    use_experience = states["layout"][0].agent.memory.use_experience
+    assert use_experience.mean() == pytest.approx(EXPERIENCE_PROB, abs=0.25)
     last_state = jax.device_get(trainer.train(states, PARAMS, 1)[0]["layout"][0])
     last_changed = changed_parts(params_after_first_stage, last_state.params)
     assert {"experience_stream", "known_appearance", "method"} <= last_changed
@@ -191,7 +184,7 @@ def test_trainer_trains_the_direct_stream_alone_and_then_both():
 
 def test_stages_of_tpn_in_streams_end_with_its_imitation():
     """Of ten chunks the tentative policy's imitation has the last two."""
-    config = RunConfig(method="tpn", decision="streams", chunk=2, total_steps=10 * 2 * 3840)
+    config = RunConfig(method="tpn", decision="streams", chunk=2, total_steps=TOTAL_STEPS)
     assert config.stage_by_chunk == [0, 0, 0, 0, 1, 1, 1, 1, 2, 2]
     direct_alone, both_streams, imitation = config.stages
     assert (direct_alone.direct_stream_only, direct_alone.uses_expert, direct_alone.adapts_online) == (
@@ -208,20 +201,25 @@ def test_stages_of_tpn_in_streams_end_with_its_imitation():
 
 
 def test_stages_of_vtnet_in_streams_have_learning_rate_schedules_of_their_own():
-    """Of ten chunks VTNet's imitation has two, the direct stream alone four; Adam's first step is the rate."""
-    config = RunConfig(method="vtnet", decision="streams", chunk=2, total_steps=10 * 2 * 3840)
+    """Of ten chunks VTNet's imitation has two, the direct stream alone four, and both streams four."""
+    config = RunConfig(method="vtnet", decision="streams", chunk=2, total_steps=TOTAL_STEPS)
     assert config.stage_by_chunk == [0, 0, 1, 1, 1, 1, 2, 2, 2, 2]
     assert [stage.direct_stream_only for stage in config.stages] == [False, True, False]
-    assert config.steps_by_purpose["imitation"] == 2 * 2 * 3840
+    assert config.steps_by_purpose["imitation"] == 2 * 2 * STEPS_PER_UPDATE
 
     stage_scalars = scalars_by_stage(config)
     assert [float(scalars.first_update) for scalars in stage_scalars] == [0, 4, 12]
     assert [float(scalars.num_updates) for scalars in stage_scalars] == [4, 8, 8]
-    assert [float(scalars.learning_rate) for scalars in stage_scalars] == pytest.approx([4e-3, 4e-3, 2e-3])
+
+    # Once the experience stream is added, the initial rate is half the default (`experience_rate`), since the added
+    # stream disturbs a policy that has already learned.
+    default_rate = PPOConfig().learning_rate
+    expected_rates = [default_rate, default_rate, 0.5 * default_rate]
+    assert [float(scalars.learning_rate) for scalars in stage_scalars] == pytest.approx(expected_rates)
 
 
 def test_fused_training_has_one_learning_rate_schedule():
-    config = RunConfig(method="org", decision="fused", chunk=2, total_steps=10 * 2 * 3840)
+    config = RunConfig(method="org", decision="fused", chunk=2, total_steps=TOTAL_STEPS)
     (scalars,) = scalars_by_stage(config)
     assert float(scalars.first_update) == 0
     assert float(scalars.num_updates) == 20
@@ -233,7 +231,7 @@ def test_fused_training_has_one_learning_rate_schedule():
 @pytest.mark.slow
 @pytest.mark.parametrize("method_name", HOST_PARAMS)
 def test_replay_of_streams_recomputes_log_probs_and_values(method_name):
-    weights, rollouts = collect_rollouts(method_name)
+    weights, rollouts = collect_stream_rollouts(method_name)
     agent_loop = make_learner(method_name).agent_loop
 
     @jax.jit
@@ -255,25 +253,25 @@ def test_replay_of_streams_recomputes_log_probs_and_values(method_name):
 @pytest.mark.parametrize("method_name", HOST_PARAMS)
 def test_gradient_reaches_the_direct_stream_alone_or_the_experience_stream(method_name):
     """The direct stream learns where it acts alone, the experience stream where it adds to that."""
-    weights, rollouts = collect_rollouts(method_name)
+    weights, rollouts = collect_stream_rollouts(method_name)
     transitions, memory, _ = rollouts[1]
     advantage = jnp.asarray(np.random.default_rng(0).normal(size=(LENGTH, ENVS)), jnp.float32)
     scalars = PPOConfig().scalars(1)
     agent_loop = make_learner(method_name).agent_loop
 
     @jax.jit
-    def compute_gradient(coin):
-        transitions_with_coin = transitions._replace(use_experience=jnp.full((LENGTH, ENVS), coin))
+    def compute_gradient(use_experience):
+        changed_transitions = transitions._replace(use_experience=jnp.full((LENGTH, ENVS), use_experience))
 
         def loss(weights):
-            replayed = replay_rollout(agent_loop.bind(weights), transitions_with_coin, memory, PARAMS)
+            replayed = replay_rollout(agent_loop.bind(weights), changed_transitions, memory, PARAMS)
             return ppo_loss(replayed, advantage, scalars, False, find_method(method_name))[0]
 
         return jax.grad(loss)(weights)
 
-    for coin in (0.0, 1.0):
+    for use_experience in (0.0, 1.0):
         # The kernel of the view holds those of both streams side by side.
-        gradient = compute_gradient(coin)
+        gradient = compute_gradient(use_experience)
         direct_view, experience_view = jnp.split(gradient["view"]["kernel"], 2, axis=-1)
         gradient |= {"view": direct_view, "experience_view": experience_view}
         zeros = jax.tree.map(jnp.zeros_like, gradient)
@@ -282,7 +280,7 @@ def test_gradient_reaches_the_direct_stream_alone_or_the_experience_stream(metho
         # Attention does not read the appearance.
         unread_parts = {"known_appearance"} if method_name.endswith("ATTENTIVE") else set()
         experience_parts = gradient.keys() - DIRECT_PARTS - unread_parts
-        assert reached - unread_parts == (experience_parts if coin else DIRECT_PARTS)
+        assert reached - unread_parts == (experience_parts if use_experience else DIRECT_PARTS)
 
 
 @pytest.mark.slow

@@ -19,9 +19,16 @@ from twins.policy import (
 )
 from twins.transformer import residual_perceptron
 
-#: Decisions between inner steps, and inner steps of an episode.
+#: Settings of `savn` in docs/methods.md: decisions between inner steps, inner steps of an episode, and their step size.
 WINDOW = 6
 NUM_STEPS = 4
+INNER_LEARNING_RATE = 0.01
+#: Settings of `tpn` in docs/methods.md: trials that a state attends to, trials in the memory, decisions between resets
+#: of the actor's change, and the step size of this change.
+NUM_ATTENDED = 10
+NUM_TRIALS = 100
+NUM_DECISIONS_BETWEEN_RESETS = 50
+ACTOR_LEARNING_RATE = 0.1
 LAYERS = ("fuse", "input_gates", "hidden_gates", "actor")
 STEP_SIZE = 1e-30  # of a complex step, so small that its square vanishes beside 1
 
@@ -48,9 +55,8 @@ class TwinTentative(TwinMethod):
         return [], [], np.zeros((params["actor"]["kernel"].shape[0] + 1, NUM_ACTIONS))
 
     def layer_changes(self, fast: Any) -> LayerChanges:
-        # The change is dropped every 50 decisions.
         states, _, change = fast
-        return {"actor": change * (len(states) % 50 > 0)}
+        return {"actor": change * (len(states) % NUM_DECISIONS_BETWEEN_RESETS > 0)}
 
     def adapt(
         self,
@@ -75,9 +81,9 @@ class TwinTentative(TwinMethod):
         answer = np.zeros(len(state) + NUM_ACTIONS)
         if actions:
             keys, values = self.trials(states, actions)
-            scores = self.scores(keys[-100:], state)
-            best_trials = np.argsort(-scores)[:10]
-            answer = softmax(scores[best_trials]) @ values[-100:][best_trials]
+            scores = self.scores(keys[-NUM_TRIALS:], state)
+            best_trials = np.argsort(-scores)[:NUM_ATTENDED]
+            answer = softmax(scores[best_trials]) @ values[-NUM_TRIALS:][best_trials]
 
         # The tentative policy names the expert's action.
         experience = residual_perceptron(network["trial"], answer)
@@ -86,7 +92,7 @@ class TwinTentative(TwinMethod):
 
         # At a repeated pose, the policy moves towards this action.
         if reading:
-            change = change + 0.1 * np.outer(append_one(hidden), expert_action - softmax(logits))
+            change = change + ACTOR_LEARNING_RATE * np.outer(append_one(hidden), expert_action - softmax(logits))
         return states, actions, change
 
     def trials(self, states: list[np.ndarray], actions: list[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -133,7 +139,7 @@ class TwinLearnedSteps(TwinMethod):
         layer_inputs = self._layer_inputs(params, window, changes)
         next_changes = {}
         for layer in LAYERS:
-            next_changes[layer] = changes[layer] - 0.01 * layer_inputs[layer].T @ gradient[layer]
+            next_changes[layer] = changes[layer] - INNER_LEARNING_RATE * layer_inputs[layer].T @ gradient[layer]
         return steps, next_changes
 
     def _output_gradient(self, params: Params, window: list, changes: LayerChanges) -> LayerChanges:

@@ -29,6 +29,9 @@ from twins.transformer import TwinTransformer
 from jaxnav.policies.method import Knowledge, Percept
 from jaxnav.policies.methods import METHODS
 
+#: Rate of `hoz` in docs/methods.md at which a view moves the node of its zone.
+NODE_RATE = 0.005
+
 
 class TwinAnonymous(TwinMethod):
     """The detection of the goal alone, without the category's name (`anonymous`)."""
@@ -110,7 +113,7 @@ class TwinZones(TwinRelations):
 
         # The zone that is most like the view moves a little towards it.
         self.zone = int(((features.visible - self.nodes) ** 2).sum(axis=1).argmin())
-        self.nodes[self.zone] += 0.005 * (features.visible - self.nodes[self.zone])
+        self.nodes[self.zone] += NODE_RATE * (features.visible - self.nodes[self.zone])
 
     def read(self, goal: int) -> tuple[np.ndarray, np.ndarray]:
         graph = self.knowledge

@@ -13,6 +13,8 @@ from twins.scene import NOT_STANDABLE, STANDABLE, Cell
 
 #: State of a cell on the map; the larger number replaces the smaller one.
 UNKNOWN, BLOCKED, FREE, VISITED = range(4)
+#: Factor on the gap of a view that shows nothing new: gamma of docs/specification.md.
+GAP_DECAY = 0.8
 
 
 class TwinFeatures(NamedTuple):
@@ -75,7 +77,7 @@ class TwinBelief:
         """Update with the categories that are visible, bool [K]."""
         # Fewer than two, or unchanged, categories shut the gate, and the gap decays.
         if visible.sum() < 2 or (visible == self.last_visible).all():
-            self.gap *= 0.8
+            self.gap *= GAP_DECAY
             return
 
         # Eq. 5: the mean divergence of the rows of visible categories, each without its own entry.

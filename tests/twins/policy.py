@@ -13,6 +13,9 @@ from jaxnav.policies.method import Knowledge
 from jaxnav.policies.spec import PolicySpec
 
 NUM_ACTIONS = 6
+#: Columns of a detection with its geometry (offsets, distance, bearing, apparent size), and their factor in `pixel`.
+GEOMETRY_COLUMNS = [2, 3, 4, 5, 6, 7]
+IMAGE_PIXELS = 300
 Params = dict[str, Any]
 #: Changes by layer: added to the kernels (the last row is the bias), or to the outputs.
 LayerChanges = dict[str, np.ndarray]
@@ -238,7 +241,7 @@ class TwinPolicy:
         if self.spec.weight_kind != "pixel":
             return features
         table = features.table.copy()
-        table[:, [2, 3, 4, 5, 6, 7]] *= 300
+        table[:, GEOMETRY_COLUMNS] *= IMAGE_PIXELS
         return features._replace(table=table)
 
     def _decide_fused(

@@ -34,7 +34,6 @@ FEW_STEPS = 150  # of each environment: 3,000 steps of a source and task
 MANY_STEPS = 5000  # 100,000 steps
 LIVING_ROOM_LIMIT = 60
 OTHER_LIMIT = 30
-SLOW = pytest.mark.slow
 TASKS = {
     "rooms": Task(rules=ROOMS, detector=PERFECT_DETECTOR),
     "apartments": Task(rules=APARTMENTS, goals=ITHOR_CATEGORIES[::2], detector=PERFECT_DETECTOR, instance_counts=True),
@@ -65,9 +64,9 @@ def make_guides(source: str, task: Task) -> list[Guide]:
     return [Guide(scene, task) for scene in load_scenes(source)]
 
 
-def scenes_and_guides(source: str, task: Task, stride: int) -> list[tuple[Scene, Guide]]:
-    """Return every `stride`-th scene of a source with its twin."""
-    return list(zip(load_scenes(source), make_guides(source, task), strict=True))[::stride]
+def scenes_and_guides(source: str, task: Task, scene_stride: int) -> list[tuple[Scene, Guide]]:
+    """Return every `scene_stride`-th scene of a source with its twin."""
+    return list(zip(load_scenes(source), make_guides(source, task), strict=True))[::scene_stride]
 
 
 def goals_of(task: Task) -> list[int]:
@@ -202,15 +201,15 @@ def test_standable_cells_equal_the_largest_component_of_the_twin():
         assert {(iz, ix) for iz, ix in standable_cells(free_cells).tolist()} == expected_cells
 
 
-def count_table_differences(scene: Scene, guide: Guide, task: Task, stride: int = 1) -> collections.Counter[str]:
-    """Count the differences of a scene's tables from the twin at every `stride`-th pose, by name."""
+def count_table_differences(scene: Scene, guide: Guide, task: Task, pose_stride: int = 1) -> collections.Counter[str]:
+    """Count the differences of a scene's tables from the twin at every `pose_stride`-th pose, by name."""
     table = compile_scene(scene, task)
     successor = pose_successors(table.ahead, task.rules)
     assert len(successor) == len(table.rows) == len(guide.cells) * task.rules.poses_per_cell
 
     # Rows, success of Done, and the poses after each action.
     differences = collections.Counter()
-    for pose in range(0, len(successor), stride):
+    for pose in range(0, len(successor), pose_stride):
         row_twin = guide.place(pose)
         num_categories = len(task.categories)
         differences.update(row_differences(table.rows[pose], row_twin, num_categories, task.instance_counts))
@@ -229,18 +228,10 @@ def count_table_differences(scene: Scene, guide: Guide, task: Task, stride: int 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("world", TASKS)
-@pytest.mark.parametrize(
-    ("source", "stride"),
-    [
-        pytest.param("coarse", 1, marks=SLOW),
-        pytest.param("maze", 2, marks=SLOW),
-        ("rooms", 3),
-        pytest.param("ithor", 3, marks=SLOW),
-    ],
-)
-def test_tables_equal_the_twin_at_every_pose(source, stride, world):
+@pytest.mark.parametrize(("source", "scene_stride"), [("coarse", 1), ("maze", 2), ("rooms", 3), ("ithor", 3)])
+def test_tables_equal_the_twin_at_every_pose(source, scene_stride, world):
     task = TASKS[world]
-    for scene, guide in scenes_and_guides(source, task, stride):
+    for scene, guide in scenes_and_guides(source, task, scene_stride):
         assert count_table_differences(scene, guide, task) == collections.Counter()
 
 
@@ -249,28 +240,25 @@ def test_tables_equal_the_twin_at_every_pose(source, stride, world):
 def test_tables_of_a_generated_home_equal_the_twin(world):
     task = dataclasses.replace(WORLDS[world].task, detector=PERFECT_DETECTOR)
     scene = make_generated_scenes(world, "val")[0]
-    assert count_table_differences(scene, Guide(scene, task), task, stride=13) == collections.Counter()
+    assert count_table_differences(scene, Guide(scene, task), task, pose_stride=13) == collections.Counter()
 
 
 @pytest.mark.parametrize("world", ["apartments", "houses"])
 def test_tables_of_a_real_apartment_equal_the_twin(world):
     task = dataclasses.replace(WORLDS[world].task, detector=PERFECT_DETECTOR)
     scene = read_scenes(require(ROBOTHOR))[0]
-    assert count_table_differences(scene, Guide(scene, task), task, stride=7) == collections.Counter()
+    assert count_table_differences(scene, Guide(scene, task), task, pose_stride=7) == collections.Counter()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("world", TASKS)
-@pytest.mark.parametrize(
-    ("source", "stride"),
-    [pytest.param("coarse", 3, marks=SLOW), pytest.param("maze", 2, marks=SLOW), ("rooms", 3), ("ithor", 3)],
-)
-def test_best_lengths_equal_the_search_of_the_twin(source, stride, world):
+@pytest.mark.parametrize(("source", "scene_stride"), [("coarse", 3), ("maze", 2), ("rooms", 3), ("ithor", 3)])
+def test_best_lengths_equal_the_search_of_the_twin(source, scene_stride, world):
     task = TASKS[world]
     rng = np.random.default_rng(0)
     num_differences = 0
     lengths = set()
-    for scene, guide in scenes_and_guides(source, task, stride):
+    for scene, guide in scenes_and_guides(source, task, scene_stride):
         best_length = compile_scene(scene, task).best_length
         assert not best_length[:, ~task.is_goal()].any()
         for pose in rng.choice(len(best_length), 4, replace=False).tolist():

@@ -130,7 +130,7 @@ def test_line_of_sight_is_blocked_by_opaque_boxes_between_camera_and_target(bloc
 
 
 @pytest.mark.parametrize(("top", "is_visible"), [(0.8, True), (0.85, False)])
-def test_box_lower_than_085_m_hides_nothing(top, is_visible):
+def test_box_lower_than_850_mm_hides_nothing(top, is_visible):
     # The line to the floor at z = 1.5 is 0.6 m high at z = 0.9, within the box, and goes on to z = 1.29.
     book = ("Book", 0, 0, 1.5, *SMALL)
     table = ("Table", 0, top / 2, 1.05, 0.3, top, 0.3)
@@ -165,13 +165,13 @@ def test_wall_cell_around_the_target_does_not_block_sight():
 
 
 @pytest.mark.parametrize(("z", "is_visible"), [(0.9, True), (0.95, False)])
-def test_line_of_sight_ends_03_m_before_the_target(z, is_visible):
+def test_line_of_sight_ends_300_mm_before_the_target(z, is_visible):
     # Wall cell [3, 0] is z from 0.625 to 0.875; the line ends at 0.6 or 0.65.
     episode = start_in_one_cell(("Book", 0, 1.5, z, *SMALL), walls=[(3, 0)])
     assert detected_categories(episode) == ({BOOK} if is_visible else set())
 
 
-def test_line_of_sight_shorter_than_03_m_is_clear():
+def test_line_of_sight_shorter_than_300_mm_is_clear():
     # Wall cell [1, 0] is z from 0.125 to 0.375. With x = 0.14 the book stands beside the wall cell and in view.
     assert detected_categories(start_in_one_cell(("Book", 0.14, 1.5, 0.2, *SMALL), walls=[(1, 0)])) == {BOOK}
 
@@ -226,7 +226,7 @@ def test_wall_cells_follow_the_origin_of_the_lattice():
 
 
 @pytest.mark.parametrize(("z", "goals"), [(1.5, {BOOK}), (1.5 + 5e-10, {BOOK}), (1.51, set())])
-def test_success_in_rooms_is_within_15_m_in_the_plane(z, goals):
+def test_success_in_rooms_is_within_1500_mm_in_the_plane(z, goals):
     # The centre at z = 1.5 and 0.9 m above the floor is 1.62 m from the camera, but 1.5 m in the plane.
     episode = start_in_one_cell(("Book", 0, 0.9, z, *SMALL))
     assert episode.successes() == goals

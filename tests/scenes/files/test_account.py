@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.fuzz_importers import FORMATS, Format, mutated
+from support.fuzz_importers import FORMATS, Format, randomly_mutated
 from support.importer_inputs.ai2thor import METADATA, TABLE
 from support.importer_inputs.habitat import EPISODES, STARTS, episode, goal, write_json
 from support.importer_inputs.procthor import HOUSE, build, item
@@ -195,7 +195,7 @@ def test_account_of_mutated_inputs_adds_up(tmp_path, scene_format: Format):
     for index in range(60):
         folder = tmp_path / str(index)
         folder.mkdir()
-        source = scene_format.write(folder, mutated(copy.deepcopy(scene_format.content), rng))
+        source = scene_format.write(folder, randomly_mutated(copy.deepcopy(scene_format.content), rng))
         options = {"maps": folder / "maps.pbz2"} if scene_format.options else {}
         try:
             import_source(folder / "o.jsonl.gz", scene_format.name, source, **options)

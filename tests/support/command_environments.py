@@ -1,4 +1,4 @@
-"""Commands under twenty environments: `python -m support.surroundings` in the folder `tests` prints a table of all.
+"""Commands under 21 environments: `python -m support.command_environments` in the folder `tests` prints a table of all.
 
 Every command ends well, or with one line that names what hinders it. An environment consists of variables, where None
 stands for one that is not set, and of redirections of the streams.
