@@ -79,7 +79,7 @@ def main() -> None:
 
 def stack_outcomes(results: Results, row_index: int) -> np.ndarray:
     """Return all outcomes of a row but the mean weight, [outcomes, S, E]."""
-    leaves = jax.tree.leaves(results.outcome._replace(mean_weight=None))
+    leaves = jax.tree.leaves(results.outcome._replace(total_weight=None))
     return np.stack(leaves)[:, row_index]
 
 

@@ -89,8 +89,8 @@ def run_frontier_search(bank: Bank, episodes: EpisodeList, step_limit: np.ndarra
         length=length,
         moves=jnp.asarray(num_moves, jnp.int32),
         distance=jnp.asarray(bank.goal_distance[end_cell, episodes.goal]),
-        choices=length,
-        mean_weight=jnp.zeros(len(lengths)),
+        num_decisions=length,
+        total_weight=jnp.zeros(len(lengths)),
     )
 
 

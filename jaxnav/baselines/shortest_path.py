@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxnav.env.objectnav import EnvParams, ObjectNav, State
 from jaxnav.evaluation.episodes import EpisodeList
-from jaxnav.evaluation.grid import EpisodeOutcome, start_states
+from jaxnav.evaluation.grid import EpisodeOutcome, finish_outcome, start_states
 from jaxnav.policies.agent_loop import Agent, AgentLoop
 from jaxnav.scenes.lattice import best_actions
 from jaxnav.scenes.tables.compile import Bank
@@ -89,6 +89,4 @@ def replay_actions(actions: jax.Array, state: State, params: EnvParams, env: Obj
     initial_carry = (agent, jnp.ones(batch_shape, bool), EpisodeOutcome.zeros(batch_shape))
     (agent, _, outcome), _ = jax.lax.scan(step, initial_carry, actions)
 
-    final_state = agent.state
-    final_cell = env.cell_of_pose(final_state.pose)
-    return outcome._replace(distance=params.tables.goal_distance[final_cell, final_state.goal])
+    return finish_outcome(outcome, agent.state, env, params)

@@ -57,9 +57,8 @@ class EpisodeOutcome(NamedTuple):
       length: int32, number of actions, Done included.
       moves: int32, number of MoveAheads.
       distance: float32, metres from the final cell to the centre of the nearest goal object.
-      choices: int32, number of decision steps: all steps unless the method has macro-actions.
-      mean_weight: float32, mean weight of the removed logits over the decision steps. While episodes run, `add_step`
-        keeps the sum of the weights here.
+      num_decisions: int32, number of decision steps: all steps unless the method has macro-actions.
+      total_weight: float32, sum of the weights of the removed logits over the decision steps.
     """
 
     done: jax.Array
@@ -67,8 +66,13 @@ class EpisodeOutcome(NamedTuple):
     length: jax.Array
     moves: jax.Array
     distance: jax.Array
-    choices: jax.Array
-    mean_weight: jax.Array
+    num_decisions: jax.Array
+    total_weight: jax.Array
+
+    @property
+    def mean_weight(self) -> np.ndarray:
+        """Mean weight of the removed logits over the decision steps of ended episodes, float32 [...] of NumPy."""
+        return np.asarray(self.total_weight) / np.maximum(self.num_decisions, 1).astype(np.float32)
 
     @classmethod
     def zeros(cls, shape: tuple[int, ...]) -> "EpisodeOutcome":
@@ -79,8 +83,8 @@ class EpisodeOutcome(NamedTuple):
             length=jnp.zeros(shape, jnp.int32),
             moves=jnp.zeros(shape, jnp.int32),
             distance=jnp.zeros(shape),
-            choices=jnp.zeros(shape, jnp.int32),
-            mean_weight=jnp.zeros(shape),
+            num_decisions=jnp.zeros(shape, jnp.int32),
+            total_weight=jnp.zeros(shape),
         )
 
     def add_step(
@@ -102,14 +106,14 @@ class EpisodeOutcome(NamedTuple):
             choices are actions.
         """
         # While a macro-action runs, the policy's output is ignored.
-        makes_choice = running if is_decision_step is None else running & is_decision_step
+        is_decided = running if is_decision_step is None else running & is_decision_step
         return self._replace(
             done=self.done | (running & result.terminated),
             success=self.success | (running & result.success),
             length=self.length + running.astype(jnp.int32),
             moves=self.moves + (running & (action == MOVE_AHEAD)).astype(jnp.int32),
-            choices=self.choices + makes_choice.astype(jnp.int32),
-            mean_weight=self.mean_weight + jnp.where(makes_choice, weight, 0.0),
+            num_decisions=self.num_decisions + is_decided.astype(jnp.int32),
+            total_weight=self.total_weight + jnp.where(is_decided, weight, 0.0),
         )
 
 
@@ -337,13 +341,9 @@ def run_to_end(
 def finish_outcome(
     outcome: EpisodeOutcome, final_state: State, env: ObjectNav, env_params: EnvParams
 ) -> EpisodeOutcome:
-    """Add the distance from the final cell, which DTS needs, and turn the sum of the weights into their mean."""
-    num_choices = jnp.maximum(outcome.choices, 1).astype(jnp.float32)
+    """Add the distance from the final cell, which DTS needs."""
     final_cell = env.cell_of_pose(final_state.pose)
-    return outcome._replace(
-        distance=env_params.tables.goal_distance[final_cell, final_state.goal],
-        mean_weight=outcome.mean_weight / num_choices,
-    )
+    return outcome._replace(distance=env_params.tables.goal_distance[final_cell, final_state.goal])
 
 
 def _write_rows(table: Tree, row_indices: jax.Array, values: Tree) -> Tree:

@@ -502,9 +502,9 @@ class PopulationMetrics:
         """Average the weight of the removed logits at each shift."""
         weights = []
         for subset in self._subsets:
-            # The mean needs only the choices and their weights, both [S, E].
+            # The mean needs only the decisions and their weights, both [S, E].
             subset_outcome = outcome._replace(
-                choices=outcome.choices[:, subset.mask], mean_weight=outcome.mean_weight[:, subset.mask]
+                num_decisions=outcome.num_decisions[:, subset.mask], total_weight=outcome.total_weight[:, subset.mask]
             )
             weights.append(mean_removal_weight(subset_outcome))
         return tuple(weights)

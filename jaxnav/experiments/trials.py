@@ -255,10 +255,9 @@ def require_estimator_config(policies: Policies) -> EstimatorConfig:
 
 
 def mean_removal_weight(outcome: EpisodeOutcome) -> float:
-    """Average the weight of the subtracted logits over all choices; 0 without any choice."""
-    num_choices = np.asarray(outcome.choices, np.float64)
-    mean_weight = np.asarray(outcome.mean_weight, np.float64)
-    return float((mean_weight * num_choices).sum() / max(num_choices.sum(), 1.0))
+    """Average the weight of the subtracted logits over all decisions; 0 without any decision."""
+    num_decisions = int(np.asarray(outcome.num_decisions).sum())
+    return float(np.asarray(outcome.total_weight, np.float64).sum() / max(num_decisions, 1))
 
 
 # Measurements

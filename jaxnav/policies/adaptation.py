@@ -155,7 +155,7 @@ class LearnedLossAdaptation:
             layer_changes[layer] = LowRankChange(inputs, outputs)
 
         window = Window(
-            start=jnp.zeros((*batch, policy.hidden)),
+            start=jnp.zeros((*batch, policy.hidden_width)),
             fuse_inputs=jnp.zeros((*batch, WINDOW, policy.layer_widths["fuse"][0])),
             done_gate=jnp.zeros((*batch, WINDOW, 1)),
         )

@@ -119,10 +119,10 @@ class Stream(nnx.Module):
           done_logit: initial bias of Done's logit, if choices are actions.
         """
         self.widths = widths
-        self.hidden = spec.sizes.hidden
+        self.hidden_width = spec.sizes.hidden
         self.done_gate = spec.done_gate
-        self.fuse = Linear(sum(widths), self.hidden, rngs=rngs)
-        self.core = nnx.GRUCell(self.hidden, self.hidden, rngs=rngs)
+        self.fuse = Linear(sum(widths), self.hidden_width, rngs=rngs)
+        self.core = nnx.GRUCell(self.hidden_width, self.hidden_width, rngs=rngs)
 
         # Small initial logits: a new policy is close to uniform except for Done.
         small_kernel = nnx.initializers.variance_scaling(1e-4, "fan_in", "normal")
@@ -130,13 +130,13 @@ class Stream(nnx.Module):
         if spec.method.chooses_actions:
             initial_logits[DONE] = done_logit
         self.actor = Linear(
-            self.hidden,
+            self.hidden_width,
             num_choices,
             kernel_init=small_kernel,
             bias_init=lambda *_: jnp.asarray(initial_logits),
             rngs=rngs,
         )
-        self.critic = Linear(self.hidden, 1, rngs=rngs)
+        self.critic = Linear(self.hidden_width, 1, rngs=rngs)
 
     def mediated_input(self, pathways: Pathways, action: jax.Array, changes: LayerChanges = NO_CHANGES) -> jax.Array:
         """Project experience and previous action; float32 [..., H].
@@ -192,12 +192,12 @@ class Stream(nnx.Module):
     @property
     def layer_widths(self) -> dict[str, tuple[int, int]]:
         """Widths of inputs and outputs of the layers that an adaptation may change."""
-        num_gates = 3 * self.hidden
+        num_gates = 3 * self.hidden_width
         return {
-            "fuse": (sum(self.widths) + 1, self.hidden),
-            "input_gates": (self.hidden + 1, num_gates),
-            "hidden_gates": (self.hidden, num_gates),
-            "actor": (self.hidden + 1, self.actor.out_features),
+            "fuse": (sum(self.widths) + 1, self.hidden_width),
+            "input_gates": (self.hidden_width + 1, num_gates),
+            "hidden_gates": (self.hidden_width, num_gates),
+            "actor": (self.hidden_width + 1, self.actor.out_features),
         }
 
     @property
@@ -390,12 +390,14 @@ class Policy(Stream):
 
     def initial_memory(self, batch: tuple[int, ...] = ()) -> PolicyState:
         """Return the memory at the start of an episode, leaves [*batch, ...]."""
-        memory = PolicyState(hidden=jnp.zeros((*batch, self.hidden)), action=jnp.full(batch, NO_ACTION, jnp.int32))
+        memory = PolicyState(
+            hidden=jnp.zeros((*batch, self.hidden_width)), action=jnp.full(batch, NO_ACTION, jnp.int32)
+        )
         # Episodes have experience unless training draws otherwise.
         if self.experience_dropout:
             memory = memory._replace(use_experience=jnp.ones(batch))
         if self.counterfactual_memory == "own":
-            memory = memory._replace(counterfactual_hidden=jnp.zeros((*batch, self.hidden)))
+            memory = memory._replace(counterfactual_hidden=jnp.zeros((*batch, self.hidden_width)))
         return memory if self.adaptation is None else memory._replace(fast=self.adaptation.init(self, batch))
 
     @property
@@ -482,7 +484,7 @@ class StreamsPolicy(Policy):
     def attend(self, encoded: EncodedPathways, memory: PolicyState | None) -> Pathways:
         """Complete the pathways: experience, from the memory of its stream, then the view of this stream."""
         # The second half of the hidden state belongs to the stream of experience.
-        stream_memory = None if memory is None else memory._replace(hidden=memory.hidden[..., self.hidden :])
+        stream_memory = None if memory is None else memory._replace(hidden=memory.hidden[..., self.hidden_width :])
         pathways = super().attend(encoded, stream_memory)
         assert encoded.view is not None  # `encode` embeds the view for both streams
         return pathways._replace(experience=jnp.concatenate([pathways.experience, encoded.view], axis=-1))
@@ -534,7 +536,7 @@ class StreamsPolicy(Policy):
     def initial_memory(self, batch: tuple[int, ...] = ()) -> PolicyState:
         """Return the memory at the start of an episode, leaves [*batch, ...]."""
         memory = super().initial_memory(batch)
-        return memory._replace(hidden=jnp.zeros((*batch, 2 * self.hidden)), use_experience=jnp.ones(batch))
+        return memory._replace(hidden=jnp.zeros((*batch, 2 * self.hidden_width)), use_experience=jnp.ones(batch))
 
     @property
     def experience_appearance(self) -> jax.Array:

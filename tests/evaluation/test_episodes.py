@@ -149,8 +149,8 @@ def test_episode_metrics_follow_worked_arithmetic():
         length=jnp.array([10, 1, 30, 2], jnp.int32),
         moves=jnp.array([6, 0, 20, 1], jnp.int32),
         distance=jnp.array([1.4, 0.3, 3.5, 1.0], jnp.float32),
-        choices=jnp.array([10, 1, 30, 2], jnp.int32),
-        mean_weight=jnp.zeros(4),
+        num_decisions=jnp.array([10, 1, 30, 2], jnp.int32),
+        total_weight=jnp.zeros(4),
     )
     outcome = jax.tree.map(np.asarray, leaves)  # the evaluator returns NumPy arrays
     metrics = episode_metrics(outcome, np.array([5, 1, 6, 2]), budgets=(2, 9))
@@ -175,8 +175,8 @@ def test_failed_episodes_are_time_outs_or_wrong_dones():
         length=jnp.ones(3, jnp.int32),
         moves=jnp.zeros(3, jnp.int32),
         distance=jnp.zeros(3),
-        choices=jnp.ones(3, jnp.int32),
-        mean_weight=jnp.zeros(3),
+        num_decisions=jnp.ones(3, jnp.int32),
+        total_weight=jnp.zeros(3),
     )
     metrics = episode_metrics(jax.tree.map(np.asarray, outcome), np.ones(3, np.int32))
     np.testing.assert_array_equal(metrics["wrong_done"], [0, 1, 0])

@@ -197,7 +197,7 @@ def run_plain_loop(policy_index, episode, use_layout, epsilon, form) -> dict[str
         "length": length,
         "moves": moves,
         "distance": tiny.BANK.goal_distance[pose // tiny.POSES_PER_CELL, goal],
-        "mean_weight": total_weight / length,
+        "total_weight": total_weight,
     }
 
 

@@ -73,8 +73,8 @@ def make_outcome(success: tuple[float, float], weight: float = 0.0) -> EpisodeOu
         done=jnp.ones(shape, bool),
         success=jnp.asarray(np.broadcast_to(is_success, shape)),
         length=jnp.full(shape, 20),
-        choices=jnp.full(shape, 20),
-        mean_weight=jnp.asarray(np.broadcast_to(weights, shape), jnp.float32),
+        num_decisions=jnp.full(shape, 20),
+        total_weight=jnp.asarray(np.broadcast_to(20 * weights, shape), jnp.float32),
     )
 
 

@@ -143,8 +143,8 @@ def make_outcome(success, length=LENGTH, weight=WEIGHT) -> EpisodeOutcome:
         length=jnp.asarray(length),
         moves=jnp.ones(shape, jnp.int32),
         distance=jnp.full(shape, 2.5),
-        choices=jnp.asarray(length),
-        mean_weight=jnp.asarray(weight),
+        num_decisions=jnp.asarray(length),
+        total_weight=jnp.asarray(weight * length, jnp.float32),
     )
 
 
@@ -154,11 +154,11 @@ def make_table(success_by_trial, gap: str = "") -> ResultTable:
     return ResultTable(TrialOutcomes(outcomes, FOUR_EPISODES).trial_rows(MAIN_FIELDS, gap))
 
 
-def test_mean_removal_weight_is_over_choices():
+def test_mean_removal_weight_is_over_decisions():
     outcome = make_outcome(SUCCESS[STDE])
-    # The weight is 0.5 in 2 choices and 0.1 in 10, of 2 x 20 choices: (1 + 1) / 40. The mean over episodes is 0.6 / 8.
+    # Weights of 0.5 in 2 decisions and of 0.1 in 10, of 2 x 20 in all: (1 + 1) / 40. The mean over episodes is 0.6 / 8.
     assert mean_removal_weight(outcome) == pytest.approx(0.05)
-    assert mean_removal_weight(outcome._replace(choices=np.zeros_like(outcome.choices))) == 0.0
+    assert mean_removal_weight(EpisodeOutcome.zeros((2, 4))) == 0.0
 
 
 def test_trial_rows_have_metrics_and_weights():

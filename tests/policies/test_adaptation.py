@@ -137,7 +137,7 @@ def window_loss(spec, window, method_weights, fast_layers):
         masked_pathways = mask_experience(pathways, use_experience)
         decision = policy.decide_with_changes(masked_pathways, memory._replace(hidden=hidden))
         hidden = decision.hidden
-        direct_hidden = hidden[: policy.hidden]
+        direct_hidden = hidden[: policy.hidden_width]
         probs = jax.nn.softmax(policy.action_logits(direct_hidden, pathways.gate))
         rows.append(jnp.concatenate([direct_hidden, probs]))
     return cast(HasLearnedLoss, policy.experience).learned_loss(jnp.stack(rows))
@@ -298,8 +298,8 @@ def test_replay_window_repeats_the_decisions_of_the_window():
     rows, layer_inputs = replay_window(policy, window, layer_changes, zero_output_changes(layer_changes))
 
     last_probs = jax.nn.softmax(last_decision.logits)
-    np.testing.assert_allclose(rows[:, : policy.hidden], decisions.hidden[WINDOW:], rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(rows[-1, policy.hidden :], last_probs, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(rows[:, : policy.hidden_width], decisions.hidden[WINDOW:], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(rows[-1, policy.hidden_width :], last_probs, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(layer_inputs["hidden_gates"], memories.hidden[WINDOW:], rtol=1e-5, atol=1e-6)
 
 

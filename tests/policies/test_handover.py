@@ -58,7 +58,7 @@ def run_episodes(agent_loop, params, *grid_cells):
 
 def assert_equal_episodes(outcome, expected):
     """Check that episodes are bit-identical, whatever was removed in them."""
-    chex.assert_trees_all_equal(outcome._replace(mean_weight=0), expected._replace(mean_weight=0))
+    chex.assert_trees_all_equal(outcome._replace(total_weight=0), expected._replace(total_weight=0))
 
 
 # A layout-blind fallback

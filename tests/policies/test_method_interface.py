@@ -324,7 +324,7 @@ def test_mean_weight_of_an_episode_averages_only_decision_steps():
     num_decisions = [math.ceil(len(trace.action) / 2) for trace in traces]
     mean_at_decisions = [trace.inferred.removal_weight[::2].mean() for trace in traces]
     mean_at_all_steps = [trace.inferred.removal_weight.mean() for trace in traces]
-    np.testing.assert_array_equal(outcome.choices, num_decisions)
+    np.testing.assert_array_equal(outcome.num_decisions, num_decisions)
     np.testing.assert_allclose(outcome.mean_weight, mean_at_decisions, rtol=1e-5)
     assert np.abs(outcome.mean_weight - mean_at_all_steps).max() > 0.01
 

@@ -46,7 +46,7 @@ def test_sweep_equals_the_stde_rows_of_an_evaluation(sweeps, evaluated, decoding
     stde_rows = [EvaluationRow("stde", epsilon, "residual", decoding) for epsilon in EPSILON]
     row_indices = np.array([evaluated.rows.index(row) for row in stde_rows])
     expected = select_row(evaluated.outcome, row_indices)
-    chex.assert_trees_all_equal(sweep.outcome._replace(mean_weight=0), expected._replace(mean_weight=0))
+    chex.assert_trees_all_equal(sweep.outcome._replace(total_weight=0), expected._replace(total_weight=0))
     np.testing.assert_allclose(sweep.outcome.mean_weight, expected.mean_weight, rtol=1e-6)
 
     # Metrics of all thresholds, seeds and episodes.

@@ -255,7 +255,7 @@ class TentativeAdaptation:
 
     def init(self, policy: "Policy", batch: tuple[int, ...]) -> TentativeState:
         """Return a state without trials and without a change."""
-        hidden_width = policy.hidden
+        hidden_width = policy.hidden_width
         return TentativeState(
             trials=jnp.zeros((*batch, NUM_TRIALS, hidden_width + NUM_ACTIONS)),
             num_decisions=jnp.zeros(batch, jnp.int32),
@@ -276,7 +276,7 @@ class TentativeAdaptation:
 
         # Predict a shortest path's action from the present state and the trials; with streams the state is that of the
         # direct stream. No gradient of the tentative policy passes the state.
-        hidden_now = jax.lax.stop_gradient(output.hidden[..., : policy.hidden])
+        hidden_now = jax.lax.stop_gradient(output.hidden[..., : policy.hidden_width])
         predicted_logits, trials = tentative(hidden_now, memory.action, trials, num_decisions)
         best_one_hot = jax.nn.one_hot(predicted_logits.argmax(axis=-1), NUM_ACTIONS, dtype=jnp.float32)
 
