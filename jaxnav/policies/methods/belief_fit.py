@@ -127,7 +127,7 @@ def fit_belief(
     )
     params = params | {"detection_rates": detection_rates(look_counts)}
 
-    # Goals of the task, and the layout's weights before the first view. Homes have rooms of all types, and one prior.
+    # Goals of the task, and the layout's weights before the first view, by the prior of homes with rooms of all types.
     goals = jnp.asarray(np.flatnonzero(agent_loop.env.task.is_goal()))
     estimator = LayoutEstimator(knowledge.priors[OTHER_ROOM])
     goal_weights = jax.vmap(estimator.goal_weights, (None, 0))(estimator.init(), goals)
