@@ -169,7 +169,7 @@ def turn_offsets(ahead: Any, right: Any, forward: Any) -> Any:
 
     Args:
       ahead, right: float [...], metres or cells.
-      forward: float [..., 2], unit vector (x, z) of the agent's heading, of as many axes as the result.
+      forward: float [..., 2], unit vector (x, z) of the agent's heading; arrays of JAX with as many axes as the result.
 
     Returns:
       float [..., 2], world (x, z), in the unit of `ahead`.
