@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from jaxnav.runs.batch import train_batch
     from jaxnav.runs.config import RunConfig
     from jaxnav.runs.evaluate import evaluate
+    from jaxnav.runs.loaded_policy import LoadedPolicy, PolicyOutput, load_policy
     from jaxnav.runs.policies import Policies
-    from jaxnav.runs.policy import LoadedPolicy, PolicyOutput, load_policy
     from jaxnav.runs.results import Results
     from jaxnav.runs.run import Run
     from jaxnav.runs.sweep import Sweep, sweep
@@ -152,7 +152,7 @@ _NAMES_BY_MODULE = {
     "runs.config": ("RunConfig",),
     "runs.evaluate": ("evaluate",),
     "runs.policies": ("Policies",),
-    "runs.policy": ("LoadedPolicy", "PolicyOutput", "load_policy"),
+    "runs.loaded_policy": ("LoadedPolicy", "PolicyOutput", "load_policy"),
     "runs.results": ("Results",),
     "runs.run": ("Run",),
     "runs.sweep": ("Sweep", "sweep"),

@@ -18,8 +18,8 @@ from jaxnav.plain_console import to_plain_console
 from jaxnav.policies.agent_loop import AgentLoop
 from jaxnav.policies.method import ActionControl, Knowledge
 from jaxnav.runs.config import LayoutConfig, RunConfig, WorldConfig
+from jaxnav.runs.loaded_policy import LoadedPolicy, load_policy
 from jaxnav.runs.policies import config_for_policy
-from jaxnav.runs.policy import LoadedPolicy, load_policy
 from jaxnav.runs.train import calibrate_estimator, explore_world
 from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world, compile_training_world
 from jaxnav.scenes.tables.compile import Bank

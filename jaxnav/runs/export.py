@@ -8,8 +8,8 @@ from typing import Literal, NamedTuple
 import jax
 
 from jaxnav.errors import InputError
+from jaxnav.runs.loaded_policy import MODEL_CARD_SIGNATURE, LoadedPolicy, export_program, format_model_card, load_policy
 from jaxnav.runs.policies import POLICIES_DIR
-from jaxnav.runs.policy import MODEL_CARD_SIGNATURE, LoadedPolicy, export_program, format_model_card, load_policy
 from jaxnav.runs.run import Run
 from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.scenes.tables.observation_row import AHEAD_SCALE, RIGHT_ORIGIN, RIGHT_SCALE, SIZE_SCALE

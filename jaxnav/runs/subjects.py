@@ -18,6 +18,7 @@ from jaxnav.errors import InputError
 from jaxnav.evaluation.agents import is_agent
 from jaxnav.policies.methods import method_label
 from jaxnav.runs.config import RunConfig
+from jaxnav.runs.loaded_policy import LoadedPolicy
 from jaxnav.runs.policies import (
     CONFIG_FILE,
     Policies,
@@ -26,7 +27,6 @@ from jaxnav.runs.policies import (
     list_packaged_policies,
     load_policy_as_run,
 )
-from jaxnav.runs.policy import LoadedPolicy
 from jaxnav.runs.run import Run
 from jaxnav.store.files import expand_home
 

@@ -24,8 +24,8 @@ from jaxnav.policies.methods import find_method
 from jaxnav.progress import show_activity
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.evaluate import check_seed, describe_evaluation, evaluate_rows
+from jaxnav.runs.loaded_policy import LoadedPolicy
 from jaxnav.runs.policies import CONFIG_FILE, Policies, is_policy, list_packaged_policies, load_policy_as_run
-from jaxnav.runs.policy import LoadedPolicy
 from jaxnav.runs.run import Run
 from jaxnav.runs.subjects import policy_in_memory_as_run
 from jaxnav.runs.worlds import compile_evaluation_world, evaluation_shift

@@ -17,7 +17,7 @@ from jaxnav.evaluation.episodes import draw_episodes
 from jaxnav.game.config import PlayConfig
 from jaxnav.game.session import KEY_ACTIONS, Game, choose_episode, play_game, prepare_game
 from jaxnav.layout import LayoutEstimator
-from jaxnav.runs.policy import LoadedPolicy
+from jaxnav.runs.loaded_policy import LoadedPolicy
 from jaxnav.scenes.files.scene_file import write_scenes
 from jaxnav.scenes.task import NUM_ACTIONS
 from jaxnav.scenes.worlds import make_generated_scenes

@@ -24,8 +24,8 @@ from support.tiers import params_by_tier
 from support.tiny_run import POLICY_NAMES, finished_run, tiny_config
 
 from jaxnav.errors import InputError
+from jaxnav.runs.loaded_policy import load_policy
 from jaxnav.runs.policies import CONFIG_FILE, PACKAGED_POLICIES
-from jaxnav.runs.policy import load_policy
 from jaxnav.runs.run import LOG_FILE, REACH_FILE, TIMES_FILE, Run, RunLogs, claim_run_dir, run_settings
 from jaxnav.store import checkpoint
 from jaxnav.store.export import export_params, load_params

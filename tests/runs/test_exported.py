@@ -22,8 +22,8 @@ import jaxnav
 from jaxnav.__main__ import main
 from jaxnav.env.objectnav import NUM_PRIORS, Observation
 from jaxnav.policies.methods import METHODS
+from jaxnav.runs.loaded_policy import LoadedPolicy, export_program, input_shapes
 from jaxnav.runs.policies import POLICIES_DIR
-from jaxnav.runs.policy import LoadedPolicy, export_program, input_shapes
 from jaxnav.scenes.tables.observation_row import RowFormat
 
 NUM_EPISODES = 3

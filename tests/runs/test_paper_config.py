@@ -24,8 +24,8 @@ from jaxnav.policies.pathways import PolicyInputs
 from jaxnav.runs import train as training
 from jaxnav.runs.config import LayoutConfig, RunConfig, WorldConfig, check_config, fill_world_defaults
 from jaxnav.runs.config_files import CONFIGS, apply_yaml
+from jaxnav.runs.loaded_policy import input_shapes
 from jaxnav.runs.policies import POLICIES_DIR, config_for_policy
-from jaxnav.runs.policy import input_shapes
 from jaxnav.runs.run import Run
 from jaxnav.runs.worlds import compile_training_world
 from jaxnav.scenes.tables.compile import Bank

@@ -18,8 +18,8 @@ import yaml
 from jaxnav.__main__ import main
 from jaxnav.cli.console import parse_config, run_command
 from jaxnav.runs.config import RunConfig, check_config
+from jaxnav.runs.loaded_policy import load_policy
 from jaxnav.runs.policies import PACKAGED_POLICIES
-from jaxnav.runs.policy import load_policy
 from jaxnav.scenes.files.scene_file import write_scenes
 from jaxnav.store.files import DIGEST_KEY, add_digest
 from support import fuzz_importers

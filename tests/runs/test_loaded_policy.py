@@ -23,8 +23,8 @@ from jaxnav.policies.adaptation import WINDOW
 from jaxnav.policies.agent_loop import AgentLoop
 from jaxnav.policies.method import Experience, Method
 from jaxnav.policies.methods import METHODS
+from jaxnav.runs.loaded_policy import LoadedPolicy
 from jaxnav.runs.policies import POLICIES_DIR
-from jaxnav.runs.policy import LoadedPolicy
 from jaxnav.runs.worlds import compile_evaluation_world
 from jaxnav.scenes.categories import ROOM_TYPES
 from jaxnav.scenes.tables.observation_row import Detector
