@@ -197,7 +197,7 @@ def merge_fields(*selections: Mapping[str, Any], **fields: Any) -> dict[str, Any
 
 
 #: Value of every field that is not given.
-_EMPTY: Mapping[str, Any] = {name: None if name in ("shift", "epsilon") else "" for name in KEY_FIELDS}
+_EMPTY: Mapping[str, Any] = dict.fromkeys(KEY_FIELDS, "") | {"shift": None, "epsilon": None}
 
 
 def _known_fields(selections: Sequence[Mapping[str, Any]], fields: Mapping[str, Any]) -> dict[str, Any]:
@@ -252,7 +252,11 @@ def _round(number: float) -> float:
 
 
 def _round_list(numbers: Iterable[float]) -> list[float | None]:
-    return [None if math.isnan(number) else _round(number) for number in numbers]
+    rounded_numbers = []
+    for number in numbers:
+        is_missing = math.isnan(number)
+        rounded_numbers.append(None if is_missing else _round(number))
+    return rounded_numbers
 
 
 # Files

@@ -235,7 +235,10 @@ def scores_table(rows: Sequence[dict[str, Any]]) -> Table:
         for metric in ("sr", "spl"):
             cells[metric, row["shift"]] = f"{Interval.from_json(row[metric]):.1f}"
     for line, cells in cells_by_line.items():
-        table.add_row(*line, *(cells[metric, shift] for metric in ("sr", "spl") for shift in shifts))
+        row = list(line)
+        for metric in ("sr", "spl"):
+            row += [cells[metric, shift] for shift in shifts]
+        table.add_row(*row)
     return table
 
 

@@ -174,8 +174,12 @@ def train_runs(
     compiled_world = compile_training_world(config, console)
     manifest_fields = {"scenes_fingerprint": compiled_world.fingerprint, "budget": config.steps_by_purpose}
     if list(run_configs) != [config]:
-        ppo_settings = [run_settings(run_config)["ppo"] for run_config in run_configs]
-        manifest_fields["points"] = {name: [settings[name] for settings in ppo_settings] for name in ppo_settings[0]}
+        # The settings of all points, one list per name.
+        values_by_name: dict[str, list[Any]] = {}
+        for run_config in run_configs:
+            for name, setting_value in run_settings(run_config)["ppo"].items():
+                values_by_name.setdefault(name, []).append(setting_value)
+        manifest_fields["points"] = values_by_name
     manifest = make_manifest(manifest_settings(config) | manifest_fields)
     check_agreement(json.dumps(manifest))
 

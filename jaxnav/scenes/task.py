@@ -194,10 +194,11 @@ class Task:
 
 def _lists_to_tuples(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values with tuples in place of lists."""
-    return {
-        name: tuple(field_value) if isinstance(field_value, list) else field_value
-        for name, field_value in values.items()
-    }
+    converted = dict(values)
+    for name, field_value in values.items():
+        if isinstance(field_value, list):
+            converted[name] = tuple(field_value)
+    return converted
 
 
 #: The tasks of AI2-THOR rooms, RoboTHOR apartments and Gibson houses.

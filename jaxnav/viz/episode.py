@@ -168,8 +168,12 @@ def play_episode(
     console = to_plain_console(console)
 
     # The arm without layout weights acts in the variant `baseline`.
-    arms = tuple(dict.fromkeys("baseline" if variant == "baseline" else "layout" for variant in variants))
-    config, policies = _load_source(source, arms)
+    arms = []
+    for variant in variants:
+        arm = "baseline" if variant == "baseline" else "layout"
+        if arm not in arms:
+            arms.append(arm)
+    config, policies = _load_source(source, tuple(arms))
     policies = policies.with_estimator(estimator)
 
     # Play the episode alone or, to compare, all episodes whose goal can be reached at every shift.

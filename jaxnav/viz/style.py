@@ -50,9 +50,14 @@ def style_axes(axes: Axes, label_size: float) -> None:
 
 def repeat_styles(styles: Sequence[dict[str, Any]], count: int) -> list[dict[str, Any]]:
     """Return styles of `count` lines; when all styles are used, they repeat with white markers."""
-    return [
-        styles[index % len(styles)] | ({"mfc": "white"} if index // len(styles) % 2 else {}) for index in range(count)
-    ]
+    line_styles = []
+    for index in range(count):
+        num_repeats, style_index = divmod(index, len(styles))
+        line_style = dict(styles[style_index])
+        if num_repeats % 2 == 1:
+            line_style["mfc"] = "white"
+        line_styles.append(line_style)
+    return line_styles
 
 
 def set_panel_title(axes: Axes, *lines: str) -> None:
