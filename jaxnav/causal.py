@@ -74,7 +74,7 @@ def removal_weight(gap: jax.Array, epsilon: jax.Array | float, form: Form = "res
 
     Args:
       gap: float32 [...], layout gap D in [0, 1].
-      epsilon: scalar or [...], threshold; may be traced. At 1 or more the weight is 0.
+      epsilon: scalar or [...], threshold, at least 0; may be traced. At 1 or more the weight is 0.
       form: `paper`, `residual` and `mixture` weigh by ReLU(D - epsilon), `switch` by 1 where D > epsilon and by 0
         elsewhere.
 
@@ -106,7 +106,7 @@ def stde(
       logits: float [..., A], factual logits a.
       counterfactual: float [..., A], counterfactual logits a_bar.
       gap: float32 [...], layout gap D in [0, 1].
-      epsilon: scalar or [...], threshold; may be traced. At 1 or more nothing is removed.
+      epsilon: scalar or [...], threshold, at least 0; may be traced. At 1 or more nothing is removed.
       form: with s = `removal_weight`,
         `paper` and `switch`: a - s a_bar, which is `tde` at s = 1;
         `residual`: (1 + s) a - s a_bar, whose coefficients add up to 1, so that logits keep their scale. It ranks
@@ -144,7 +144,7 @@ def remove_from_sum(
       direct: float [..., A], scores without experience.
       experience: float [..., A], what experience adds to the scores; finite.
       gap: float32 [...], layout gap D in [0, 1].
-      epsilon: scalar or [...], threshold; may be traced. At 1 or more nothing is removed.
+      epsilon: scalar or [...], threshold, at least 0; may be traced. At 1 or more nothing is removed.
       form: `paper` and `mixture`, s = ReLU(D - epsilon), or `switch`, s = 1 where D > epsilon.
 
     Returns:

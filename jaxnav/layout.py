@@ -105,7 +105,7 @@ class EstimatorConfig:
 
         # Numbers must lie in the ranges that the docstring gives.
         for name, is_valid, requirement in (
-            ("increment", self.increment in range(1, 51), "a whole number from 1 to 50"),
+            ("increment", isinstance(self.increment, int) and 1 <= self.increment <= 50, "a whole number from 1 to 50"),
             ("decay", 0 <= self.decay <= 1, "a number from 0 to 1"),
             ("passes", self.passes >= 1 and self.passes % 1 == 0, "a whole number of 1 or more"),
             ("passes", self.gate or self.passes == 1, "1, because later passes are reproduced for the gate alone"),
@@ -331,10 +331,11 @@ class LayoutEstimator(struct.PyTreeNode):
 
     @staticmethod
     def goal_weights(state: LayoutState, goal: jax.Array | int) -> jax.Array:
-        """The goal's column of w, float32 [K]: w times g in eq. 7, because g is one-hot.
+        """The goal's column of w (`expectation`), float32 [K]: w times g in eq. 7, because g is one-hot.
 
         A method multiplies what Z holds of category i by the entry w_ig, see `Experience.encode`.
         """
+        # The other columns of `expectation` would cost K times as much.
         goal_share = state.alpha[:, goal] / state.alpha.sum(-1)
         return goal_share.at[goal].add(1)
 
@@ -342,7 +343,7 @@ class LayoutEstimator(struct.PyTreeNode):
         """Tanh of the reduced row divergences KL(posterior || belief) (eq. 5), float32 []; 1 for the gap `clock`.
 
         Args:
-          alpha: float32 [K, K], belief before the step.
+          alpha: float32 [K, K], belief before the step; with `own_column`, with 1 more on the diagonal.
           counts: float32 [K, K], counts of the step.
           visible: float32 [K], 1 where a category is visible.
         """

@@ -346,7 +346,7 @@ def test_named_estimators_have_the_documented_settings():
 @pytest.mark.parametrize(
     ("field", "valid_values", "invalid_values"),
     [
-        ("increment", (1, 50), (0, 51, 1.5)),
+        ("increment", (1, 50), (0, 51, 1.5, 5.0)),
         ("decay", (0.0, 1.0), (-0.1, 1.1, float("nan"))),
         ("passes", (1, 3), (0, 1.5)),
         ("strength", (0.1, None), (0.0, -1.0, float("inf"))),

@@ -77,10 +77,13 @@ def table_rows(
       default_form: form of sTDE if `forms` is None.
 
     Raises:
-      InputError: no kind of removal or an unknown one, an unknown form, no epsilon, or one outside [0, inf), or NaN.
+      InputError: no kind of removal or an unknown one, no form or an unknown one, no epsilon, or one outside [0, inf),
+        or NaN.
     """
     if not epsilons:
         raise InputError("--epsilon: give at least one number")
+    if forms is not None and not forms:
+        raise InputError("--form: give at least one form")
     if not removals:
         raise InputError("--removal: give tde, cde or both")
     for removal in removals:

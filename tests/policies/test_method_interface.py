@@ -130,15 +130,27 @@ def test_find_method_refuses_a_name_without_a_method(name, parts):
         assert part in str(refusal.value)
 
 
-def test_find_method_finds_methods_of_other_packages_by_entry_point(monkeypatch):
-    entry_point = metadata.EntryPoint("theirs", "support.methods:COUNTING", "jaxnav.methods")
+def announce_method(monkeypatch, name, path):
+    """Let an installed package announce a method as an entry point."""
+    entry_point = metadata.EntryPoint(name, path, "jaxnav.methods")
 
     def list_entry_points(group):
         return [entry_point] if group == entry_point.group else []
 
     monkeypatch.setattr(metadata, "entry_points", list_entry_points)
+
+
+def test_find_method_finds_methods_of_other_packages_by_entry_point(monkeypatch):
+    announce_method(monkeypatch, "theirs", "support.methods:COUNTING")
     assert find_method("theirs") == dataclasses.replace(methods.COUNTING, name="theirs")
     find_method.cache_clear()
+
+
+@pytest.mark.parametrize("path", ["theirs", "support.methods"])
+def test_find_method_refuses_entry_points_that_announce_a_module(path, monkeypatch):
+    announce_method(monkeypatch, "theirs", path)
+    with pytest.raises(InputError, match=f"method 'theirs': .*'{path}'; announce package.module:NAME"):
+        find_method("theirs")
 
 
 # Acting and replay

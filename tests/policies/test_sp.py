@@ -105,6 +105,7 @@ def test_graph_from_file_reads_weights_and_skips_comments(tmp_path):
         ("Zebra,Book", (":1: ", "'Zebra'", "choose one of Book, Chair, Fridge")),
         ("\nBook", (":2: ", "'Book'", "write two categories")),
         ("Book,Book", (":1: ", "'Book,Book'", "write two categories")),
+        ("Chair,Stool", (":1: ", "'Chair,Stool'", "write two categories")),  # a stool is a Chair
         ("Book,Chair,1,1", (":1: ", "'Book,Chair,1,1'", "write two categories")),
         ("Book,Chair,0", (":1: weight '0'", "above 0 and at most 1")),
         ("Book,Chair,-1", (":1: weight '-1'", "above 0 and at most 1")),

@@ -159,6 +159,8 @@ def test_eval_refuses_removals_that_training_did_not_prepare(drawn_run, capsys, 
     assert len(message.splitlines()) == 1
 
 
-def test_evaluate_requires_a_kind_of_removal(drawn_run):
+def test_evaluate_requires_a_kind_and_a_form_of_removal(drawn_run):
     with pytest.raises(InputError, match="--removal: give tde, cde or both"):
         jaxnav.evaluate(drawn_run, removal=())
+    with pytest.raises(InputError, match="--form: give at least one form"):
+        jaxnav.evaluate(drawn_run, form=())

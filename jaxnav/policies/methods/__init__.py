@@ -69,11 +69,14 @@ def _entry_point_path(name: str) -> str:
     """Return the `package.module:NAME` that an entry point announces.
 
     Raises:
-      InputError: there is no such entry point.
+      InputError: there is no such entry point, or it announces a module instead of a method.
     """
     entry_points = {point.name: point for point in metadata.entry_points(group=ENTRY_POINT_GROUP)}
     if name in entry_points:
-        return entry_points[name].value
+        path = entry_points[name].value
+        if ":" not in path:
+            raise InputError(f"method {name!r}: its entry point announces {path!r}; announce package.module:NAME")
+        return path
 
     # Nothing has this name: suggest the closest one.
     method_names = [*METHODS, *entry_points]

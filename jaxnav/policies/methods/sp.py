@@ -119,15 +119,19 @@ def _parse_edge(source: str, edge_text: str, categories: tuple[str, ...]) -> tup
       edge_text: the line without its comment.
       categories: names of the categories.
     """
+    example = ",".join(categories[:2])
+    problem = InputError(f"{source}: {edge_text!r} is not an edge; write two categories, such as {example}")
+
     # Two different names, and perhaps a weight.
     fields = [field.strip() for field in edge_text.split(",")]
     names = tuple(fields[:2])
-    if len(fields) not in (2, 3) or names[0] == names[-1]:
-        example = ",".join(categories[:2])
-        raise InputError(f"{source}: {edge_text!r} is not an edge; write two categories, such as {example}")
+    if len(fields) not in (2, 3) or names[0] == names[1]:
+        raise problem
 
-    # Unknown categories have a negative index.
+    # Unknown categories have a negative index. Two names can stand for one category.
     first_category, second_category = category_ids(names, categories)
+    if first_category == second_category >= 0:
+        raise problem
     for name, category in zip(names, (first_category, second_category), strict=True):
         if category < 0:
             close_matches = difflib.get_close_matches(name, categories, n=1)
