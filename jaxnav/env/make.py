@@ -56,8 +56,8 @@ def make(
     world_config = WORLDS[world]
     task = task or world_config.task
 
-    # Scenes, shifted and compiled.
-    # A whole path is never taken for the name of a world.
+    # Scenes, shifted and compiled. An absolute path equals no name of a world, so a file called
+    # `rooms` is read as a file.
     file = world if scenes is None else str(expand_home(scenes).absolute())
     shifted_scenes = SceneSource(file, split, seed, shift, shift_by).open(task)
     bank = compile_bank((shifted_scenes[scene_index] for scene_index in range(len(shifted_scenes))), task)

@@ -17,9 +17,10 @@ def check_environment(
 ) -> None:
     """Check that an environment keeps its contract.
 
-    The checks: reset and step compile once; equal keys give equal episodes; outputs have their shapes, dtypes and
-    ranges; no episode is terminated and truncated at once; a batch of N equals N single episodes; time restarts after
-    an episode ends, and the final state is the one before the reset; observations equal `observe(state)`.
+    The checks: reset and step compile once; equal keys give equal resets; outputs have their shapes, dtypes and
+    ranges; no episode is terminated and truncated at once; the first episode of a batch equals the same episode alone;
+    time restarts after an episode ends, and the final state is the one before the reset; observations equal
+    `observe(state)`.
 
     Args:
       env: environment to check.

@@ -220,7 +220,7 @@ class Evaluator:
                 agent_loop=self._agent_loop,
                 env_params=env_params,
                 knowledge=knowledge,
-                infer_and_act=self._infer_and_act,
+                step_agents=self._infer_and_act,
             )
 
         return jax.lax.map(run_entry, grid)
@@ -246,11 +246,11 @@ def _run_episodes(
     agent_loop: AgentLoop,
     env_params: EnvParams,
     knowledge: Knowledge,
-    infer_and_act: Callable[..., tuple[Agent, StepResult, InferenceTrace]],
+    step_agents: Callable[..., tuple[Agent, StepResult, InferenceTrace]],
 ) -> EpisodeOutcome:
     """Run all episodes of one grid entry until every episode has ended.
 
-    `infer_and_act` is the function of this name with the features that the evaluator compiles.
+    `step_agents` takes one step of each episode: `infer_and_act` with the features that the evaluator compiles.
     """
     num_episodes = len(initial_states.pose)
     policy_key = jax.random.fold_in(key, config.policy_index)
@@ -259,7 +259,7 @@ def _run_episodes(
     context = DecisionContext(policy, config.use_layout, agent_loop, knowledge, env_params)
 
     def step(batch: EpisodeBatch) -> EpisodeBatch:
-        next_agent, result, trace = infer_and_act(config, context, batch.agent, batch.running, batch.episode_keys)
+        next_agent, result, trace = step_agents(config, context, batch.agent, batch.running, batch.episode_keys)
         # The memory holds the executed action, which differs from the choice where the method has macro-actions.
         action = policy_memory(result.agent).action
         is_decision_step = agent_loop.is_decision_step(batch.agent)  # of the state before the step
@@ -378,7 +378,7 @@ def infer_and_act(
       The agents after the step [E], the result of the step, leaves [E], and the trace of the inference, leaves
       [E, ...].
     """
-    # Factual decision; entries without the layout replace its weights by ones.
+    # Embed the inputs of the decision; entries without the layout replace its weights by ones.
     policy, agent_loop = context.policy, context.agent_loop
     factual = embed_decision_inputs(agent, context)
     pathways, memory = factual.pathways, factual.memory

@@ -113,7 +113,7 @@ class InferenceTrace(NamedTuple):
       layout_weights: float32 [K], the layout's weights for the goal (eq. 7); ones without the layout.
       gap: float32, layout gap at the step; after `select_gap` if experience may be removed.
       removal_weight: float32, weight of the removed logits.
-      factual_logits: float32 [A], logits of the decision.
+      factual_logits: float32 [A], logits before the removal; of replaced inputs if the entry replaces a part.
       removed_logits: float32 [A], logits to remove; equal to `factual_logits` if nothing can be removed.
       action_logits: float32 [A], logits that chose the action.
     """

@@ -66,7 +66,7 @@ class Interval:
         return Interval(self.mean - level, self.low - level, self.high - level)
 
     def __rsub__(self, level: float) -> "Interval":
-        return Interval(level - self.mean, level - self.high, level - self.low)  # 0 without a sign
+        return Interval(level - self.mean, level - self.high, level - self.low)  # -interval + level would give -0.0
 
     def to_json(self) -> dict[str, Any]:
         """Convert to JSON; undefined values are null."""

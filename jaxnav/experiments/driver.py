@@ -155,7 +155,8 @@ def run_experiment(config: ExperimentConfig, console: Console) -> list[str]:
       The text of each page.
 
     Raises:
-      InputError: a document is not a page of an experiment, or a run is impossible.
+      InputError: a document is not a page of an experiment, a run is impossible, or a file of results belongs to other
+        settings.
     """
     console = to_plain_console(console)
 
@@ -264,7 +265,7 @@ def load_results(config: ExperimentConfig, missing: Collection[str] = ()) -> dic
     for split in ("train", "val", "test"):
         settings = evaluation_settings(config) | {"split": split, "shift_by": config.shift_by}
         for name in ("shifts", "decodings", "steps"):
-            del settings[name]  # of single parts
+            del settings[name]  # every part has its own
         rows: list[ResultRow] = []
         for path in sorted((config.results / split).glob("*.jsonl")):
             if split != config.split or path.stem not in missing:

@@ -60,7 +60,8 @@ class ResultRow:
     Attributes:
       world: name of the world.
       run: name of the agent, which is that of its training run.
-      variant: how its policies are used: `baseline`, `layout`, `tde`, `stde`, `random`, or a removal rule.
+      variant: how its policies are used: `baseline`, `layout`, `tde`, `stde`, `random`, ..., a removal rule or the
+        label of its reference in a mixture.
       decoding: `argmax` for best actions, `sample` for sampled ones.
       shift: layout shift, from 0 to 1; None for a mixture of shifts.
       gap: layout gap of sTDE.

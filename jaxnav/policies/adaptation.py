@@ -227,13 +227,14 @@ def limit_inner_steps(adaptation: "Adaptation | None", inner_steps: int) -> "Ada
     """Return an adaptation that takes at most `inner_steps` inner steps in an episode; None for 0.
 
     Raises:
-      InputError: the method takes no inner steps, or fewer; 0 is always possible.
+      InputError: the method takes no inner steps, or `inner_steps` is above the number that it stores. The limit 0 is
+        always possible.
     """
     # Without inner steps the policy needs no adaptation at all.
     if inner_steps == 0:
         return None
     if not isinstance(adaptation, LearnedLossAdaptation):
-        raise InputError(f"inner_steps is {inner_steps}, but the method adapts without inner steps; give 0 or omit it")
+        raise InputError(f"inner_steps is {inner_steps}, but the method takes no inner steps; give 0 or omit it")
     if not 0 < inner_steps <= adaptation.inner_steps:
         capacity = f"an episode stores {adaptation.inner_steps} windows of {WINDOW} actions"
         raise InputError(f"inner_steps is {inner_steps}, but {capacity}; give 0 to {adaptation.inner_steps}")

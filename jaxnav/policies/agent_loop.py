@@ -298,13 +298,13 @@ class AgentLoop:
         """Bind parameters to the policy, or to a `HandoverPolicy` of the policy and its fallback.
 
         Args:
-          params: parameters of the policy; {"agent": ..., "without": ...} with a fallback.
+          params: parameters of the policy; {"primary": ..., "fallback": ...} with a fallback.
         """
         if self.use_own_fallback:
             return HandoverPolicy(self.bind(params))
         if self.fallback_spec is None:
             return self.bind(params)
-        return HandoverPolicy(self.bind(params["agent"]), bind(self.fallback_spec, params["without"]))
+        return HandoverPolicy(self.bind(params["primary"]), bind(self.fallback_spec, params["fallback"]))
 
     def start(
         self, key: jax.Array, num_envs: int, memory: PolicyState | None, knowledge: Any, env_params: EnvParams

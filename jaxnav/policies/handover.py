@@ -26,34 +26,34 @@ class HandoverPolicy:
     of the latter hold the controlled direct effect of scene and goal; experience dropout trains them.
 
     Attributes:
-      experienced: the policy with experience.
+      primary: the policy with experience.
       fallback: the policy that a removal leaves. A layout-blind one has no tracker, and the two share one spatial
         memory.
-      is_same_network: True if the fallback is `experienced` under do(Z = 0).
+      is_same_network: True if the fallback is `primary` under do(Z = 0).
     """
 
     has_additive_scores: ClassVar[bool] = False
     num_scene_factors: ClassVar[int] = 1  # the scene is the factor of the fallback
 
-    def __init__(self, experienced: Policy, layout_blind: Policy | None = None) -> None:
+    def __init__(self, primary: Policy, layout_blind: Policy | None = None) -> None:
         """Pair two policies.
 
         Args:
-          experienced: the policy with experience.
-          layout_blind: the fallback; None for `experienced` under do(Z = 0).
+          primary: the policy with experience.
+          layout_blind: the fallback; None for `primary` under do(Z = 0).
         """
-        self.experienced = experienced
-        self.fallback = experienced if layout_blind is None else layout_blind
+        self.primary = primary
+        self.fallback = primary if layout_blind is None else layout_blind
         self.is_same_network = layout_blind is None
 
     def initial_memory(self, batch: tuple[int, ...] = ()) -> PolicyState:
         """Return the state of both policies at the start of an episode, their hidden states joined."""
-        experienced_state = self.experienced.initial_memory(batch)
+        primary_state = self.primary.initial_memory(batch)
         fallback_state = self.fallback.initial_memory(batch)
-        hidden = jnp.concatenate([experienced_state.hidden, fallback_state.hidden], axis=-1)
+        hidden = jnp.concatenate([primary_state.hidden, fallback_state.hidden], axis=-1)
         # The fallback takes the place of the counterfactual branch.
-        return experienced_state._replace(
-            hidden=hidden, fast=(experienced_state.fast, fallback_state.fast), counterfactual_hidden=None
+        return primary_state._replace(
+            hidden=hidden, fast=(primary_state.fast, fallback_state.fast), counterfactual_hidden=None
         )
 
     def pathways(self, inputs: PolicyInputs, memory: PolicyState) -> Pathways:
@@ -62,9 +62,9 @@ class HandoverPolicy:
         The experience is the pair of the two policies' pathways. Scene and goal are 1 [..., 1]; a scene of 0 removes
         the fallback, whatever the goal.
         """
-        experienced_state, fallback_state = self._split_state(memory)
+        primary_state, fallback_state = self._split_state(memory)
         # The policy with experience reads everything, the layout weights included.
-        experienced_pathways = self.experienced.pathways(inputs, experienced_state)
+        primary_pathways = self.primary.pathways(inputs, primary_state)
         if self.is_same_network:
             fallback_pathways = do(self.fallback.pathways(inputs, fallback_state), experience=0.0)
         else:
@@ -74,36 +74,36 @@ class HandoverPolicy:
 
         # The scene is a factor on the fallback, float32 [..., 1].
         ones = jnp.ones_like(inputs.layout_weights[..., :1])
-        both_pathways: Any = (experienced_pathways, fallback_pathways)
+        both_pathways: Any = (primary_pathways, fallback_pathways)
         return Pathways(scene=ones, goal=ones, experience=both_pathways, gate=ones)
 
     def decide(self, pathways: Pathways, memory: PolicyState) -> Decision:
         """Return the logits of the policy that acts, with the value of the policy with experience."""
-        experienced_state, fallback_state = self._split_state(memory)
-        experienced_pathways, fallback_pathways = cast(tuple[Pathways, Pathways], pathways.experience)
+        primary_state, fallback_state = self._split_state(memory)
+        primary_pathways, fallback_pathways = cast(tuple[Pathways, Pathways], pathways.experience)
         # Both policies decide at every step, whichever acts.
-        experienced_output = self.experienced.decide(experienced_pathways, experienced_state)
+        primary_output = self.primary.decide(primary_pathways, primary_state)
         fallback_output = self.fallback.decide(fallback_pathways, fallback_state)
 
         # Rounded logits add and subtract without error, so removal restores the direct logits exactly.
         direct_logits = round_to_grid(fallback_output.logits)
-        experience_logits = round_to_grid(experienced_output.logits) - direct_logits
+        experience_logits = round_to_grid(primary_output.logits) - direct_logits
         logits = pathways.scene * direct_logits + experience_logits
 
         # Both memories continue, joined in the order of `initial_memory`.
-        hidden = jnp.concatenate([experienced_output.hidden, fallback_output.hidden], axis=-1)
-        fast = (experienced_output.fast, fallback_output.fast)
-        return experienced_output._replace(logits=logits, hidden=hidden, fast=fast)
+        hidden = jnp.concatenate([primary_output.hidden, fallback_output.hidden], axis=-1)
+        fast = (primary_output.fast, fallback_output.fast)
+        return primary_output._replace(logits=logits, hidden=hidden, fast=fast)
 
     def _split_state(self, memory: PolicyState) -> tuple[PolicyState, PolicyState]:
         """Split the joined state into those of the two policies."""
         # The state of the policy with experience comes first.
         fallback_width = self.fallback.initial_memory().hidden.shape[-1]
-        experienced_width = memory.hidden.shape[-1] - fallback_width
-        experienced_hidden, fallback_hidden = jnp.split(memory.hidden, [experienced_width], axis=-1)
-        experienced_fast, fallback_fast = memory.fast
-        experienced_state = memory._replace(hidden=experienced_hidden, fast=experienced_fast)
-        return experienced_state, PolicyState(fallback_hidden, memory.action, fallback_fast)
+        primary_width = memory.hidden.shape[-1] - fallback_width
+        primary_hidden, fallback_hidden = jnp.split(memory.hidden, [primary_width], axis=-1)
+        primary_fast, fallback_fast = memory.fast
+        primary_state = memory._replace(hidden=primary_hidden, fast=primary_fast)
+        return primary_state, PolicyState(fallback_hidden, memory.action, fallback_fast)
 
 
 #: Either kind of policy that an agent loop can run.

@@ -50,7 +50,7 @@ Params = dict[str, Any]
 INITIAL_DONE_LOGIT = -2.5
 #: The Done gate is this factor times the confidence of the goal's detection. A gate of 0 makes the logit of Done 0, so
 #: Done stays possible; at first it is then even likelier than with the bias above.
-DONE_GATE = 0.58
+DONE_GATE_FACTOR = 0.58
 
 #: Additive changes of layer outputs by an adaptation: layer name (`fuse`, `input_gates`, `hidden_gates` or `actor`) ->
 #: function from the layer's inputs [..., M] to a change [..., N]. A 1 is appended to the inputs of layers with a bias.
@@ -222,7 +222,7 @@ def append_one(values: jax.Array) -> jax.Array:
 class Policy(Stream):
     """Three pathways, fused before one recurrent core; works on single observations and batches."""
 
-    num_views: ClassVar[int] = 1  # the scene layer embeds the view once per stream
+    num_streams: ClassVar[int] = 1  # every stream embeds the view for itself
     num_scene_factors: ClassVar[int] = 0  # last entries of the scene pathway that are the factor of a stream
     #: True if logits are log probabilities of detection, an exact sum of direct scores and experience; see
     #: `jaxnav.causal.remove_experience`.
@@ -252,7 +252,7 @@ class Policy(Stream):
         if spec.spatial_memory is not None:
             num_scene_inputs += spec.spatial_memory.num_inputs
         self.appearance = nnx.Embed(perceived_spec.num_categories, sizes.appearance, rngs=rngs)
-        self.view = Linear(num_scene_inputs, self.num_views * sizes.view_outputs, rngs=rngs)
+        self.view = Linear(num_scene_inputs, self.num_streams * sizes.view_outputs, rngs=rngs)
 
         # Goal G: detections and the category of the goal. Experience Z: the method's own module, see `experience`.
         self.detections = CategoryMaps.for_detections(perceived_spec, rngs)
@@ -317,7 +317,7 @@ class Policy(Stream):
 
         # The Done gate follows the confidence of the goal's detection.
         confidence = (features.table[..., CONFIDENCE_INDEX] * features.goal).sum(axis=-1, keepdims=True)
-        gate = DONE_GATE * confidence if self.done_gate else jnp.ones_like(confidence)
+        gate = DONE_GATE_FACTOR * confidence if self.done_gate else jnp.ones_like(confidence)
         return EncodedPathways(
             scene=scene, goal=goal_embedding, experience=experience, gate=gate, reading=inputs.reading
         )
@@ -462,7 +462,7 @@ class StreamsPolicy(Policy):
     counterpart is `experience_stream`.
     """
 
-    num_views = 2
+    num_streams = 2
     num_scene_factors = 1
 
     def __init__(self, spec: PolicySpec, rngs: nnx.Rngs) -> None:

@@ -99,7 +99,11 @@ def _find_path(targets: jax.Array, passable: jax.Array, start: jax.Array) -> Pat
 def _find_paths(
     num_paths: int, is_batched: list[bool], targets: jax.Array, passable: jax.Array, start: jax.Array
 ) -> tuple[PathField, Any]:
-    """Find the paths of several maps, leaves [B, ...], and say that all leaves have that axis; see `find_path`."""
+    """Find the paths of several maps: the batching rule of `find_path`.
+
+    Returns:
+      The paths, leaves [B, ...], and for each leaf True, because all have the batch axis.
+    """
     arguments = []
     for argument, has_batch_axis in zip((targets, passable, start), is_batched, strict=True):
         arguments.append(argument if has_batch_axis else jnp.broadcast_to(argument, (num_paths, *argument.shape)))

@@ -207,7 +207,7 @@ def evaluate(
     report = build_report(
         build_result_rows(results, names, trained=is_trained),
         _build_differences(results, trained=is_trained),
-        _write_notes(found_subject, policies, results, table.decision_shares),
+        _build_notes(found_subject, policies, results, table.decision_shares),
         table.compilations,
         _subject_settings(found_subject, policies) | evaluation_settings,
         table.decision_shares,
@@ -283,7 +283,7 @@ def _evaluate_table(
     return _EvaluatedTable(rows, outcome, join_episode_lists(episode_lists), decision_shares, compilations)
 
 
-def _write_notes(
+def _build_notes(
     subject: PolicySubject, policies: Policies, results: Results, decision_shares: list[dict[str, Any]]
 ) -> list[str]:
     """Notes below the table: limits of the evaluation, decision shares, and the budget and convergence of a run."""
@@ -359,7 +359,7 @@ def evaluate_rows(
     episode_lists = draw_episode_lists(compiled_world, num_episodes, seed)
     evaluator = evaluator or Evaluator(policies.make_agent_loop(compiled_world), has_controls=False)
     grid = inference_grid(rows, policies.arms, policies.num_seeds)
-    outcome = _run_grid(evaluator, grid, policies, compiled_world, episode_lists, seed)
+    outcome = _evaluate_grid(evaluator, grid, policies, compiled_world, episode_lists, seed)
     return episode_lists, outcome, evaluator.compilations
 
 
@@ -385,13 +385,13 @@ def _evaluate_with_replacements(
     # Only the parts that are replaced are compiled.
     parts = tuple(sorted({replacement.part for replacement in replacements}))
     evaluator = Evaluator(policies.make_agent_loop(compiled_world), has_controls=False, replaced_parts=parts)
-    outcome = _run_grid(evaluator, grid, policies, compiled_world, episode_lists, seed)
+    outcome = _evaluate_grid(evaluator, grid, policies, compiled_world, episode_lists, seed)
     row_outcome = jax.tree.map(lambda leaf: leaf[: len(rows)], outcome)
     replaced_outcome = jax.tree.map(lambda leaf: leaf[len(rows) :], outcome)
     return row_outcome, replaced_outcome, evaluator.compilations
 
 
-def _run_grid(
+def _evaluate_grid(
     evaluator: Evaluator,
     grid: InferenceConfig,
     policies: Policies,

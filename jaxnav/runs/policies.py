@@ -198,7 +198,7 @@ class Policies(NamedTuple):
           fallback_policies: equally many layout-blind policies, trained for the same task.
 
         Returns:
-          Policies with parameters {"agent": ..., "without": ...}.
+          Policies with parameters {"primary": ..., "fallback": ...}.
 
         Raises:
           InputError: the fallback policies have a tracker, another number of choices or another spatial memory, or are
@@ -221,7 +221,7 @@ class Policies(NamedTuple):
                 f"hand-over: {num_policies} policies cannot hand over to {num_fallbacks}; train both runs with equal "
                 "arms and seeds"
             )
-        paired_params = {"agent": self.params, "without": fallback_policies.params}
+        paired_params = {"primary": self.params, "fallback": fallback_policies.params}
         return self._replace(params=paired_params, fallback_spec=fallback_policies.spec)
 
     def with_own_fallback(self) -> "Policies":

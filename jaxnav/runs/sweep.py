@@ -20,7 +20,6 @@ from jaxnav.evaluation.grid import EpisodeOutcome, Evaluator, episode_metrics
 from jaxnav.evaluation.sweep_tables import ThresholdRow, sweep_notes, sweep_table, threshold_rows
 from jaxnav.evaluation.variants import table_row
 from jaxnav.plain_console import to_plain_console
-from jaxnav.policies.methods import find_method
 from jaxnav.progress import show_activity
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.evaluate import check_seed, describe_evaluation, evaluate_rows
@@ -237,7 +236,7 @@ def _load_layout_policies(
     else:
         run = _open_run(source)
         config = run.config
-        if not find_method(config.method).hosts_layout:
+        if not config.policy_method.hosts_layout:
             raise InputError(
                 f"{config.run_dir}: method {config.method!r} cannot use the layout, which sTDE needs; give a run of "
                 "another method (`jaxnav list methods`)"

@@ -37,7 +37,7 @@ from jaxnav.layout import ESTIMATORS, EstimatorConfig
 from jaxnav.plain_console import PlainConsole, to_plain_console
 from jaxnav.policies.agent_loop import AgentLoop
 from jaxnav.policies.method import Knowledge
-from jaxnav.policies.methods import METHODS, find_method
+from jaxnav.policies.methods import METHODS
 from jaxnav.policies.network import Params
 from jaxnav.policies.testing import check_method
 from jaxnav.progress import show_activity
@@ -290,7 +290,7 @@ def connect_devices(config: RunConfig) -> Mesh | None:
 def warn_if_rollout_too_short(config: RunConfig, console: PlainConsole) -> None:
     """Warn if rollouts are shorter than the interval between two choices of the method."""
     # Methods such as `semexp` choose once in several actions.
-    choice_interval = find_method(config.method).control.interval
+    choice_interval = config.policy_method.control.interval
     rollout = config.ppo.rollout
     if rollout < choice_interval:
         console.print(
@@ -313,7 +313,7 @@ def warn_if_more_steps(config: RunConfig, console: PlainConsole) -> None:
 def prepare_training(
     config: RunConfig, compiled_world: CompiledWorld, manifest: dict[str, Any], console: PlainConsole
 ) -> Preparation:
-    """Layout prior, layout estimator and the method's own statistics, learned once in each run.
+    """Learn what a run learns once: layout prior and estimator, the method's knowledge, and policies that are fitted.
 
     Args:
       config: configuration of the run, whose directory is locked.
@@ -439,7 +439,7 @@ def learn_knowledge(
     priors = layout_priors(exploration.prior_counts, estimator_config)
 
     # The method's own knowledge, from the tables of all banks.
-    learn = find_method(config.method).learn
+    learn = config.policy_method.learn
     method_knowledge = {}
     if learn is not None:
         method_knowledge = jax.tree.map(jnp.asarray, learn(compiled_world.banks, np.asarray(exploration.counts)))

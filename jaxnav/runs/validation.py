@@ -21,7 +21,6 @@ from jaxnav.evaluation.variants import EvaluationRow, inference_grid
 from jaxnav.plain_console import PlainConsole
 from jaxnav.policies.agent_loop import AgentLoop
 from jaxnav.policies.method import Knowledge
-from jaxnav.policies.methods import find_method
 from jaxnav.policies.network import Params
 from jaxnav.runs.config import RunConfig
 from jaxnav.runs.worlds import CompiledWorld, compile_evaluation_world
@@ -77,7 +76,7 @@ class Validator:
           InputError: the method cannot act in the val scenes.
         """
         val_world = compile_evaluation_world(config, "val", None, None, console)
-        val_world.check_method(find_method(config.method), knowledge)
+        val_world.check_method(config.policy_method, knowledge)
 
         # Tables of equal sizes, so that one compilation serves both splits.
         shared_fields = {

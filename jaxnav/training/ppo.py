@@ -966,7 +966,7 @@ class Learner:
             carry = apply_gradient(
                 config, policy_params, opt_state, gradient, scalars.learning_rate, self.stage.lr_scale_by_path
             )
-            # One vector again, so that the norm is the one by which the optimizer clips.
+            # One vector, as in the optimizer, which clips by this norm where no parameter is frozen.
             return carry, losses | {"gradient_norm": optax.tree.norm(ravel_pytree(gradient)[0])}
 
         def run_epoch(carry: TrainCarry, epoch_key: jax.Array) -> tuple[TrainCarry, Metrics]:

@@ -31,7 +31,7 @@ BLIND_LOOP = AgentLoop(ENV, ANONYMOUS_SPEC)
 PAIR_LOOP = AgentLoop(ENV, tiny.SPEC, tiny.ESTIMATOR, fallback_spec=ANONYMOUS_SPEC)
 EXPERIENCED_PARAMS = tiny.random_params(6)
 BLIND_PARAMS = tiny.random_params(9, ANONYMOUS_SPEC)
-PAIR_PARAMS = {"agent": EXPERIENCED_PARAMS, "without": BLIND_PARAMS}
+PAIR_PARAMS = {"primary": EXPERIENCED_PARAMS, "fallback": BLIND_PARAMS}
 EPISODES = draw_episodes(tiny.BANK, 24, seed=1)
 KEY = jax.random.key(3)
 BATCH_SIZE = 8
@@ -292,7 +292,7 @@ def test_handover_joins_the_parameters_of_the_two_policies():
     pair = make_policies(tiny.SPEC, experienced_params).with_handover_to(blind_policies)
     assert pair.fallback_spec == ANONYMOUS_SPEC
     assert pair.num_seeds == 1
-    chex.assert_trees_all_equal(pair.params, {"agent": experienced_params, "without": blind_params})
+    chex.assert_trees_all_equal(pair.params, {"primary": experienced_params, "fallback": blind_params})
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from jaxnav.env.objectnav import Observation
 from jaxnav.policies.features import scale_geometry, unpack_features
 from jaxnav.policies.method import Stage
 from jaxnav.policies.methods import find_method
-from jaxnav.policies.network import DONE_GATE, bind, init_params
+from jaxnav.policies.network import DONE_GATE_FACTOR, bind, init_params
 from jaxnav.policies.pathways import Pathways, PolicyInputs, PolicyState
 from jaxnav.policies.spec import Direct, PolicySpec
 from jaxnav.scenes.tables.observation_row import RowFormat
@@ -179,7 +179,7 @@ def observe_confidences(other_detections=DETECTED):
 
 
 def test_gate_is_proportional_to_the_confidence_of_the_goal(gated_policy, plain_policy):
-    assert DONE_GATE == 0.58
+    assert DONE_GATE_FACTOR == 0.58
     for other_detections in (DETECTED, UNDETECTED):
         gate = gated_policy.pathways(observe_confidences(other_detections)).gate
         np.testing.assert_allclose(gate[:, 0], GATE_FACTORS, rtol=1e-6)

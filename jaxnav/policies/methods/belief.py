@@ -59,6 +59,7 @@ from jaxnav.policies.methods.map_tracker import (
     SQUARE_CELLS,
     MapTracker,
     SearchState,
+    is_new_view,
     learned_view_table,
     nearest_looks,
     other_category_bits,
@@ -69,7 +70,6 @@ from jaxnav.policies.pathways import NO_ACTION, Decision, EncodedPathways, Pathw
 from jaxnav.policies.spec import PolicySpec
 from jaxnav.scenes.tables.compile import Bank
 from jaxnav.scenes.tables.observation_row import RowFormat
-from jaxnav.scenes.task import MOVE_AHEAD
 
 #: Cells along each side of the map, 24 m.
 MAP_CELLS = 96
@@ -120,14 +120,13 @@ class BeliefTracker(MapTracker):
         row_format = RowFormat(knowledge.priors.shape[-1])
         view_table = learned_view_table(knowledge.method, row_format.view)
 
-        # After a collision the view is the previous one, whose detections are no new evidence.
-        is_new_view = (percept.action != MOVE_AHEAD) | percept.moved
+        # Only a new view is new evidence.
         distance_bin = nearest_looks(
             percept.row, next_state.position, percept.heading, row_format, view_table, len(state.cells)
         )
         look_bins = np.arange(NUM_LOOK_DISTANCES, dtype=np.int32)[:, None, None]
         assert state.looks is not None
-        is_look = is_new_view & (distance_bin[None] == look_bins) & (state.looks < _MAX_LOOKS)
+        is_look = is_new_view(percept) & (distance_bin[None] == look_bins) & (state.looks < _MAX_LOOKS)
         return next_state._replace(looks=state.looks + is_look.astype(jnp.uint8))
 
     def read(self, state: SearchState, knowledge: Knowledge, goal: jax.Array) -> BeliefReading:  # type: ignore[override]
@@ -290,7 +289,7 @@ class TargetPolicy(Policy):
 
     Attributes:
       method: the predictor.
-      places: the score by places.
+      places: scores squares by floor and walls alone, without categories.
       detection_rates: float32 [K, D], probability that a look at a square detects an object of each category there.
       hidden_logit: float32 [], log odds that no look at its square shows an object, because something hides it.
     """

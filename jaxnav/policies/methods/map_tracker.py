@@ -229,14 +229,19 @@ def make_view_table(rules: Rules, view: int) -> ViewTable:
     return ViewTable(offsets, distances, twins.astype(np.int32))
 
 
+def is_new_view(percept: Percept) -> jax.Array:
+    """Return whether the view is a new one, bool []; after a collision it is the previous one."""
+    return (percept.action != MOVE_AHEAD) | percept.moved
+
+
 def learned_view_table(setup: Mapping[str, Any], view: int) -> ViewTable:
     """Return the cells of a view under the rules of the training homes.
 
     Args:
-      setup: what SemExp learned before training; only tasks with `front_cell="move"` have `front_cell_is_move`.
+      setup: knowledge of SemExp; only that of tasks with `front_cell="move"` has the entry `front_cell_is_move`.
       view: V, cells along each side of a view.
     """
-    # Which entries there are is known when a program is traced, so the table is a constant of the program.
+    # The presence of an entry is static, so the table is a constant of the program; a value would be traced.
     front_cell: FrontCell = "move" if "front_cell_is_move" in setup else "nearest"
     return make_view_table(Rules(headings=len(setup["steps"]), front_cell=front_cell), view)
 
@@ -332,8 +337,7 @@ class MapTracker:
 
         # Only a new view can confirm the goal: after a collision the view is the previous one.
         goal_sight, success_distance = self._judge_goal_sight(state, percept, position, knowledge)
-        is_new_view = (percept.action != MOVE_AHEAD) | percept.moved
-        confirmed_sight = jnp.where(is_new_view, goal_sight, jnp.minimum(goal_sight, state.goal_sight))
+        confirmed_sight = jnp.where(is_new_view(percept), goal_sight, jnp.minimum(goal_sight, state.goal_sight))
 
         # Draw the view, the collision and a cleared goal on the map.
         view_table = learned_view_table(knowledge.method, row_format.view)
@@ -413,7 +417,8 @@ def _clear_goal_once(cells_before: jax.Array, cells: jax.Array, position: jax.Ar
     own_word = cells[row, column]
     cleared_bits = cells_before & ~cells & category_bit(goal)
 
-    # Restore the goal if this cell has cleared it before; mark the cell if it has cleared it now.
+    # Restore the goal if this cell has cleared it before, but not where the agent stands. Mark this cell if it has
+    # cleared the goal now.
     cells = cells | jnp.where(own_word & TRIED_BIT > 0, cleared_bits, NO_BITS)
     tried_bit = jnp.where((cleared_bits > 0).any(), TRIED_BIT, NO_BITS)
     return cells.at[row, column].set(own_word | tried_bit)

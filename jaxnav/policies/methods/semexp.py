@@ -114,8 +114,9 @@ def learn_search_setup(banks: Iterable[Bank], counts: np.ndarray) -> dict[str, n
 
     Returns:
       The values of `learn_motion`, and by name `enough`, float32 [], metres within which Done succeeds; `edge`, float32
-      [], the share of a goal's apparent size that is added to these metres; `lines`, int32 [N], the row indices of a
-      map that holds the largest home; `front_cell_is_move`, bool [], True, only if `Rules.front_cell` is `move`.
+      [], the share of a goal's apparent size that is added to these metres; `lines`, int32 [N], of
+      which only the length is read: the size of a map that holds the largest home, which must be static; and
+      `front_cell_is_move`, bool [], present only if `Rules.front_cell` is `move`.
 
     Raises:
       InputError: the map has no bit for a category, or the agent cannot walk to all eight neighbours.

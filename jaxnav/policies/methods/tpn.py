@@ -74,7 +74,7 @@ class PoseTracker:
       length: N, number of poses that are remembered.
     """
 
-    length: int = 100
+    length: int = NUM_TRIALS
 
     def init(self, knowledge: Knowledge) -> PoseHistory:
         """Return a history without poses."""
@@ -318,7 +318,7 @@ TPN = Method(
         Stage(
             _IMITATION_SHARE,
             tentative_loss,
-            lr_scale_by_path=lambda path: path[:2] == ("method", "tentative"),
+            lr_scale_by_path=lambda path: 1.0 if path[:2] == ("method", "tentative") else 0.0,
             uses_expert=True,
         ),
     ),

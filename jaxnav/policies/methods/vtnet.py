@@ -132,12 +132,13 @@ class Transformer(Experience):
     def _slots(self, features: Features) -> jax.Array:
         """Return the category of each token.
 
-        The first token is the goal, detected or not; further detected categories follow in their order.
+        The first token is the goal, detected or not; other detected categories follow in their order. Categories beyond
+        the N tokens are dropped.
 
         Returns:
           float32 [..., N, K], one-hot, or zero where there are fewer categories than tokens.
         """
-        # Rank [..., K] of each category among the tokens, -1 for categories without a token.
+        # Rank [..., K] of each category among the tokens: -1 if undetected; ranks of N or more get no token.
         other_visible = features.visible * (1.0 - features.goal)
         other_rank = jnp.where(other_visible > 0, jnp.cumsum(other_visible, axis=-1), -1.0)
         rank = jnp.where(features.goal > 0, 0.0, other_rank)
@@ -207,7 +208,7 @@ def experience_imitation_loss(replay: Any, *_: Any) -> tuple[jax.Array, dict[str
 _IMITATION = Stage(
     _IMITATION_SHARE,
     experience_imitation_loss,
-    lr_scale_by_path=lambda path: path[0] == "method",
+    lr_scale_by_path=lambda path: 1.0 if path[0] == "method" else 0.0,
     uses_expert=True,
 )
 _REINFORCEMENT = Stage(
