@@ -250,37 +250,39 @@ def _evaluate_table(
     Without `trained`, decision shares have intervals over scenes alone.
     """
     # Rows that hand over to the policy itself are run apart.
-    rows = [row for row in all_rows if not row.uses_own_fallback]
+    grid_rows = [row for row in all_rows if not row.uses_own_fallback]
     with show_activity(console, describe_evaluation(num_episodes, shift)):
         # Replacements are further rows of the same grid. The oracle reads the tables of every bank once more.
         episode_lists = draw_episode_lists(compiled, num_episodes, seed)
-        replacements = list_cost_replacements(rows, costs)
+        replacements = list_cost_replacements(grid_rows, costs)
         max_room_episodes = limit_room_episodes(episode_lists, costs)
         outcome, replaced_outcome, compilations = _evaluate_with_replacements(
-            rows, replacements, max_room_episodes, policies, compiled, episode_lists, seed
+            grid_rows, replacements, max_room_episodes, policies, compiled, episode_lists, seed
         )
         env_params = prefetch_env_params(compiled, range(len(compiled.banks)))
         oracle_outcome = run_oracle(compiled.banks, episode_lists, env_params, compiled.env)
 
         # Decision shares come last: two compilations at once raise the peak of memory, and save three seconds at most.
-        share_rows = rows_with_shares(rows)
+        share_rows = rows_with_shares(grid_rows)
         share_counts, probed_episodes = count_shares(share_rows, policies, compiled, episode_lists, seed)
     costs_by_replacement = measure_costs(
-        rows, outcome, replacements, replaced_outcome, episode_lists, max_room_episodes, trained=trained
+        grid_rows, outcome, replacements, replaced_outcome, episode_lists, max_room_episodes, trained=trained
     )
     decision_shares = build_decision_shares(
         share_rows, share_counts, probed_episodes, costs_by_replacement, trained=trained
     )
 
-    rows = [*rows, table_row("oracle", None, None, "argmax")]
-    outcome = _append_row(outcome, oracle_outcome)
+    # The table ends with the shortest path; hand-overs stand in the order of `all_rows`.
+    finished_rows = [*grid_rows, table_row("oracle", None, None, "argmax")]
+    finished_outcome = _append_row(outcome, oracle_outcome)
     if any(row.uses_own_fallback for row in all_rows):
         with show_activity(console, "evaluating removals that leave the policy without experience"):
-            rows, outcome, num_compilations = _add_fallback_rows(
-                all_rows, rows, outcome, policies, compiled, num_episodes, seed
+            finished_rows, finished_outcome, num_compilations = _add_fallback_rows(
+                all_rows, finished_rows, finished_outcome, policies, compiled, num_episodes, seed
             )
         compilations += num_compilations
-    return _EvaluatedTable(rows, outcome, join_episode_lists(episode_lists), decision_shares, compilations)
+    all_episodes = join_episode_lists(episode_lists)
+    return _EvaluatedTable(finished_rows, finished_outcome, all_episodes, decision_shares, compilations)
 
 
 def _build_notes(
