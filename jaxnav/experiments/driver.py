@@ -10,7 +10,7 @@ import shutil
 from collections.abc import Callable, Collection, Iterator
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rich.console import Console
 
@@ -62,6 +62,26 @@ def _layout_blind_agent(config: ExperimentConfig, run: AgentRun) -> list[str]:
     return [config.reference_agent]
 
 
+def _no_settings(config: ExperimentConfig, run: AgentRun) -> dict[str, Any]:
+    """No settings besides those of every measurement."""
+    return {}
+
+
+def _comparisons(config: ExperimentConfig, run: AgentRun) -> dict[str, Any]:
+    """The agents to compare with."""
+    return {"against": list(run.against)}
+
+
+def _groups(config: ExperimentConfig, run: AgentRun) -> dict[str, Any]:
+    """The groups of agents."""
+    return {"groups": config.groups}
+
+
+def _selected_removals(config: ExperimentConfig, run: AgentRun) -> dict[str, Any]:
+    """The removals, unless all are compared."""
+    return {} if config.removals == ("*",) else {"removals": list(config.removals)}
+
+
 class Measurement(NamedTuple):
     """Something that an experiment measures of an agent.
 
@@ -69,6 +89,7 @@ class Measurement(NamedTuple):
       measure: called with the bench and the run, and with a shift or a decoding if `parts` names either.
       parts: setting of the experiment whose values are measured in parts of their own.
       references: names of the agents that a run is compared with.
+      own_settings: settings that determine the results of this measurement alone.
       compares_shifts: True if it compares layout shifts, and so needs several.
       compares_removals: True if it compares removals: `removals` selects some, and the folds of a dataset are evaluated
         together.
@@ -77,6 +98,7 @@ class Measurement(NamedTuple):
     measure: Callable[..., Iterator[ResultRow]]
     parts: str | None = None
     references: Callable[[ExperimentConfig, AgentRun], list[str]] = _no_agents
+    own_settings: Callable[[ExperimentConfig, AgentRun], dict[str, Any]] = _no_settings
     compares_shifts: bool = False
     compares_removals: bool = False
 
@@ -87,15 +109,16 @@ def _removal_measurement(remaining: RemainingDecision) -> Measurement:
         partial(measure_removals, remaining=remaining),
         parts="decodings",
         references=_layout_blind_agent,
+        own_settings=_selected_removals,
         compares_shifts=True,
         compares_removals=True,
     )
 
 
 MEASUREMENTS = {
-    "evaluation": Measurement(measure_evaluation, references=_compared_agents),
+    "evaluation": Measurement(measure_evaluation, references=_compared_agents, own_settings=_comparisons),
     "frontier": Measurement(measure_frontier),
-    "groups": Measurement(measure_groups, references=_grouped_agents),
+    "groups": Measurement(measure_groups, references=_grouped_agents, own_settings=_groups),
     "account": Measurement(measure_account, references=_layout_blind_agent),
     "trials": Measurement(measure_trials, parts="shifts"),
     "variants": Measurement(measure_variants, parts="shifts"),
@@ -220,12 +243,7 @@ def list_parts(config: ExperimentConfig, bench: Bench) -> list[Part]:
             for fold_run in run.fold_runs:
                 references += [bench.find_run(fold_run.world, agent) for agent in measurement.references(config, run)]
             settings = part_settings(config, run, [reference for reference in references if reference is not None])
-            if measurement.measure is measure_evaluation:
-                settings["against"] = list(run.against)
-            if measurement.measure is measure_groups:
-                settings["groups"] = config.groups
-            if measurement.compares_removals and config.removals != ("*",):
-                settings["removals"] = list(config.removals)
+            settings |= measurement.own_settings(config, run)
             measure = partial(measurement.measure, bench, run)
             if measurement.parts is None:
                 parts.append(Part(f"{run.name}-{name}", settings, measure))
