@@ -476,12 +476,14 @@ class SharedDesign(NamedTuple):
     runs: Clusters
 
     @classmethod
-    def from_conditions(cls, conditions: Sequence[tuple[Sequence[str], Sequence[str]]], seeds: int) -> "SharedDesign":
+    def from_conditions(
+        cls, conditions: Sequence[tuple[Sequence[str], Sequence[str]]], num_seeds: int
+    ) -> "SharedDesign":
         """Collect the scenes of all conditions.
 
         Args:
           conditions: for each condition, the names of its scenes and their room types.
-          seeds: number of training runs.
+          num_seeds: number of training runs.
         """
         # A scene that occurs in several conditions is one scene.
         room_by_name: dict[str, str] = {}
@@ -492,7 +494,9 @@ class SharedDesign(NamedTuple):
         all_names = tuple(sorted(room_by_name))
         scene_plans = np.array(list(map(floor_plan_name, all_names)))
         scene_rooms = np.array([room_by_name[name] for name in all_names])
-        return cls(all_names, scene_plans, scene_rooms, scene_clusters(scene_plans, scene_rooms), run_clusters(seeds))
+        return cls(
+            all_names, scene_plans, scene_rooms, scene_clusters(scene_plans, scene_rooms), run_clusters(num_seeds)
+        )
 
     def jackknife_means(
         self, sums: np.ndarray, weights: np.ndarray, names: Sequence[str], *, trained: bool = True

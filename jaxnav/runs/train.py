@@ -842,10 +842,10 @@ def _export_policies(
     exploration: Exploration,
 ) -> None:
     """Export the policy of every arm and seed."""
-    for arm, seeds in policies.items():
+    for arm, params_by_seed in policies.items():
         # Baselines are exported without the layout estimator.
         arm_estimator = estimator_config if arm == "layout" else None
-        for seed, params in enumerate(seeds):
+        for seed, params in enumerate(params_by_seed):
             export_folder = config.run_dir / POLICIES_DIR / f"{arm}-{seed}"
             export_policy(export_folder, config, params, knowledge, arm_estimator, exploration)
 
@@ -963,13 +963,13 @@ class ProgressDisplay:
         # Mean success of each arm, and gradient steps that were skipped in any seed.
         success_rates = []
         num_skipped = 0
-        for arm, seeds in metrics.items():
+        for arm, metrics_by_seed in metrics.items():
             # Success is undefined in seeds in which no episode ended.
-            seed_success = [seed_metrics["success"] for seed_metrics in seeds]
+            seed_success = [seed_metrics["success"] for seed_metrics in metrics_by_seed]
             has_success = not np.isnan(seed_success).all()
             success_text = f"{100 * np.nanmean(seed_success):.0f} %" if has_success else "undefined (no episode ended)"
             success_rates.append(f"{arm} {success_text}")
-            num_skipped += sum(seed_metrics["skipped_steps"] for seed_metrics in seeds)
+            num_skipped += sum(seed_metrics["skipped_steps"] for seed_metrics in metrics_by_seed)
         skip_note = f", {num_skipped:.0f} gradient steps skipped as not finite" if num_skipped else ""
 
         # This is success in training scenes, with sampled actions. Next to the bar is no room for the speed.

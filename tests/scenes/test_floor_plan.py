@@ -67,7 +67,7 @@ def test_generated_apartments_of_one_floor_plan_share_walls():
 
 def success_interval(scene_names):
     """Return the interval of a success rate that differs from scene to scene."""
-    design = SharedDesign.from_conditions([(scene_names, ["apartment"] * len(scene_names))], seeds=1)
+    design = SharedDesign.from_conditions([(scene_names, ["apartment"] * len(scene_names))], num_seeds=1)
     successes = np.arange(len(scene_names), dtype=float)[None]
     return design.interval(design.jackknife_means(successes, np.ones(len(scene_names)), scene_names, trained=False))
 
