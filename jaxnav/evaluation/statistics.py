@@ -59,6 +59,8 @@ class Interval:
         bounds = f"{self.low:{spec}}, {self.high:{spec}}" if self.has_bounds else "-"
         return f"{self.mean:{spec}} [{bounds}]"
 
+    # Mirrored and shifted intervals serve verdicts, which read the bounds alone: `std` and `seeds` are left out.
+
     def __neg__(self) -> "Interval":
         return Interval(-self.mean, -self.high, -self.low)
 

@@ -47,6 +47,9 @@ class SpatialMemory:
       reach: number of cells that are read on each side of the agent.
       stride: distance in cells between neighbouring cells that are read.
       front_cell: cell in front of the agent that a view shows, see `Rules.front_cell`; that of the task.
+
+    Raises:
+      ValueError: the map is too small for the cells that are read, and would show cells of its opposite side.
     """
 
     headings: int
@@ -54,6 +57,11 @@ class SpatialMemory:
     reach: int = 5
     stride: int = 2
     front_cell: FrontCell = "nearest"
+
+    def __post_init__(self) -> None:
+        num_spanned = 2 * self.reach * self.stride + 1
+        if self.size < num_spanned:
+            raise ValueError(f"size is {self.size}: the cells that are read span {num_spanned}; give at least as many")
 
     def init(self) -> ExplorationMap:
         """Return an empty map with the agent at its centre."""

@@ -217,6 +217,13 @@ def test_nothing_within_the_window_is_forgotten(monkeypatch):
     chex.assert_trees_all_equal((maps, readings), record_readings(memory, walk))
 
 
+def test_maps_smaller_than_the_cells_that_are_read_are_refused():
+    # Five cells on each side at a stride of two span 2 * 5 * 2 + 1 = 21 cells.
+    assert SpatialMemory(8, size=21).size == 21
+    with pytest.raises(ValueError, match="size is 20: the cells that are read span 21"):
+        SpatialMemory(8, size=20)
+
+
 # Policies
 
 
